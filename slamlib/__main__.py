@@ -1,6 +1,7 @@
 """The command line, `slamlib` or `python -m slamlib`: its options, commands and exit codes."""
 
 import argparse
+import logging
 import os
 import signal
 import sys
@@ -47,7 +48,7 @@ def _parser():
     """The parser of the command line; `run` of what it parses is the function of the command."""
     whole = argparse.ArgumentParser(
         prog="slamlib", description="Vehicle SLAM from wheel encoders, markers and UWB ranges.")
-    commands = whole.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    commands = whole.add_subparsers(dest="command", required=True)
 
     def add_command(name, run, help):
         command = commands.add_parser(name, help=help)
@@ -58,13 +59,12 @@ def _parser():
                        ("hand-in", "build the report, and zip it with the result files")):
         add = add_command(name, _build, help)
         add("--data", type=Path, default="data", help="folder of the datasets (default data)")
-        add("datasets", nargs="*", metavar="DATASET", help="names of folders in it (all of them "
-            "when none is named, but simulated ones where there are others)")
+        add("datasets", nargs="*", help="names of folders in it (all of them when none is named, "
+            "but simulated ones where there are others)")
 
     add = add_command("solve", _solve, "solve problems without notebooks")
-    add("folders", nargs="+", type=Path, metavar="FOLDER", help="a dataset's folder; each of "
-        "several has its results in the folder of its name in OUT, and drives.csv is the table "
-        "over all")
+    add("folders", nargs="+", type=Path, help="a dataset's folder; each of several has its results "
+        "in the folder of its name in OUT, and drives.csv is the table over all")
     add("--out", type=Path, required=True, help="folder for the results")
     add("-j", "--jobs", type=int, default=1, help="datasets solved at a time (default 1)")
     add("--problem", action="append", default=[],
@@ -78,9 +78,10 @@ def _parser():
 
 def _build(options):
     """Build the report, and the zip to hand in where that is the command."""
-    from slamlib.report import NotebookError, build_report, handin
-    from slamlib.report.notebooks import notebooks_folder, read_options
-    shown = read_options("report.toml")
+    from slamlib.report import handin
+    from slamlib.report.build import build_report
+    from slamlib.report.notebooks import NotebookError, notebooks_folder, read_options
+    shown = read_options(Path("report.toml"))
     pages = Path("report")
     if options.command == "hand-in":
         shown = handin.hand_in_options(shown)
@@ -116,8 +117,7 @@ def _told(summaries):
                 print(f"{name}: {problem} could not be solved: {row['failed']}")
                 code = 3
         for doubt in summary["doubts"]:
-            told = f"{name}: doubt ({doubt['what']}): {doubt['sentence']} {doubt['advice']}"
-            print(told.rstrip())
+            print(f"{name}: doubt ({doubt['what']}): {doubt['sentence']} {doubt['advice']}")
     for summary in summaries:
         if "error" in summary:
             code = _ended(2, summary["error"])
@@ -128,11 +128,12 @@ def _solve(options):
     """Solve the problems of one dataset or several, and print a table of each."""
     from slamlib.solve import solve_folder, solve_folders
     problems = [f"problem{each}" for each in options.problem]
-    how = {"problems": problems, "verbose": options.verbose}
+    if options.verbose:
+        logging.basicConfig(format="%(message)s", level=logging.INFO)
     if len(options.folders) > 1:
-        summaries = solve_folders(options.folders, options.out, options.jobs, **how)
+        summaries = solve_folders(options.folders, options.out, options.jobs, problems)
     else:
-        summaries = [solve_folder(options.folders[0], options.out, **how)]
+        summaries = [solve_folder(options.folders[0], options.out, problems)]
     code = _told(summaries)
     print(f"results: {options.out.resolve()}", file=sys.stderr)
     return code

@@ -5,10 +5,9 @@ plain numbers. `solve_to_folder` does so for all problems of a dataset, `solve_f
 datasets.
 """
 
-import logging
 import sys
 import time
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -19,11 +18,9 @@ import numpy as np
 from slamlib import estimate, fuse, fuse_increments, localize
 from slamlib.core import evaluation, odometry, se2
 from slamlib.core.errors import DatasetError, require
-from slamlib.core.hint import Fusion
 from slamlib.core.records import Dataset, Truth
 from slamlib.io import files, results
 from slamlib.io.dataset import (
-    all_notes,
     inventory_lines,
     read_dataset,
     read_truth,
@@ -44,13 +41,13 @@ class Task(NamedTuple):
     """What a problem is called, and what it needs."""
 
     title: str
-    sensor: str | None           # attribute of Dataset
+    sensor: str                  # attribute of Dataset
     role: str                    # in figures (`notebook.plotting.ROLES`)
 
 
 # Every problem in the order of solution, by the name of its results folder.
 PROBLEMS = {
-    "problem1": Task("odometry", None, "odometry"),
+    "problem1": Task("odometry", "ticks", "odometry"),
     "problem2": Task("ArUco", "aruco", "aruco"),
     "problem2_hint": Task("odometry + ArUco, hint", "aruco", "hint"),
     "problem2_fused": Task("odometry + ArUco", "aruco", "fused"),
@@ -68,12 +65,14 @@ COLUMNS = ["dataset", "problem", "estimated_poses", "ate_m", "ate_aligned_m", "n
 
 @dataclass(frozen=True)
 class Solution:
-    """Poses, maps and facts of one problem; it has every pose of the encoder file."""
+    """Poses, maps and facts of one problem; it has every pose of the encoder file.
+
+    The world frame is that of the first pose with an estimate.
+    """
 
     problem: str                   # key of PROBLEMS
     poses: np.ndarray              # (n, 3) in the world frame; NaN where there is no estimate
     covariances: np.ndarray        # (n, 3, 3) of [x, y, heading] in world axes
-    world: int = 0                 # index from 0 of the pose whose frame is the world frame
     maps: dict = field(default_factory=dict)    # ids, places and covariances by name of the file
     facts: dict = field(default_factory=dict)       # plain numbers for the summary
     doubts: tuple[Doubt, ...] = ()
@@ -89,8 +88,7 @@ class Failure:
 
 def allows(dataset: Dataset, problem: str) -> bool:
     """True if the dataset has the sensor that a problem needs."""
-    sensor = PROBLEMS[problem].sensor
-    return sensor is None or getattr(dataset, sensor) is not None
+    return getattr(dataset, PROBLEMS[problem].sensor) is not None
 
 
 def find(problem: str, dataset: Dataset, previous: SlamResult | None = None):
@@ -119,11 +117,13 @@ def problem_solution(problem: str, dataset: Dataset, found) -> Solution:
     rounding.
     """
     if problem == "problem1":
-        found = Fusion(*found, rejected=0)
+        found = Solution(problem, *found)
+    if problem == "problem2":
+        found = _at_all_poses(found, len(dataset.ticks))
     maps = {}
-    if hasattr(found, "marker"):
+    if len(getattr(found, "marker", ())):
         maps["ArucoMap"] = found.marker, found.marker_in_world, found.marker_covariance
-    if hasattr(found, "antenna"):
+    if len(getattr(found, "antenna", ())):
         maps["UwbMap"] = found.antenna, found.antenna_in_world, found.antenna_covariance
     is_known = np.isfinite(found.poses[:, 0])
     covariances = [found.covariances[is_known]]
@@ -139,23 +139,18 @@ def problem_solution(problem: str, dataset: Dataset, found) -> Solution:
         doubts = fusion_doubts(found, dataset.vehicle)
     if isinstance(found, SlamResult):
         doubts = solution_doubts(found)
-    maps = {name: values for name, values in maps.items() if len(values[0])}
-    solution = Solution(problem, found.poses, found.covariances, maps=maps, facts=_facts(found),
-                        doubts=doubts)
-    if problem == "problem2":
-        return _at_all_poses(solution, found.frame, len(dataset.ticks))
-    return solution
+    return Solution(problem, found.poses, found.covariances, maps, _facts(found), doubts)
 
 
-def _at_all_poses(solution, frame, count):
-    """The Solution at frames (f,) as one of all poses; the first localized pose is the world."""
+def _at_all_poses(found, count):
+    """The Localization with `count` poses, NaN where it has no frame."""
     poses = np.full((count, 3), np.nan)
     covariances = np.full((count, 3, 3), np.nan)
-    poses[frame] = solution.poses
-    covariances[frame] = solution.covariances
-    known = np.flatnonzero(np.isfinite(poses[:, 0]))
+    poses[found.frame] = found.poses
+    covariances[found.frame] = found.covariances
+    known = np.isfinite(poses[:, 0])
     poses[known, 2] = np.unwrap(poses[known, 2])
-    return replace(solution, poses=poses, covariances=covariances, world=int(known[0]))
+    return replace(found, poses=poses, covariances=covariances)
 
 
 def _facts(found):
@@ -163,29 +158,23 @@ def _facts(found):
     facts = {}
     if getattr(found, "slip", None) is not None:
         facts["slip_sqrt_m"] = found.slip
-    if not isinstance(found, SlamResult):
-        return facts
-    facts["unconfirmed"] = found.unconfirmed.tolist()
-    facts["calibration"] = [row for row in found.calibration_table if row["sigma"]]
-    if len(found.rejected):
-        facts["marker_noise_factor"] = found.noise.sightings
-    if len(found.antenna):
-        facts["range_noise_factor"] = found.noise.ranges
+    if isinstance(found, SlamResult):
+        facts["unconfirmed"] = found.unconfirmed.tolist()
+        facts["calibration"] = [row for row in found.calibration_table if row["sigma"]]
+        if len(found.rejected):
+            facts["marker_noise_factor"] = found.noise.sightings
+        if len(found.antenna):
+            facts["range_noise_factor"] = found.noise.ranges
     return facts
 
 
-def solved(problem: str, dataset: Dataset, found) -> Solution | Failure:
-    """The Solution from what `find` returned, or the Failure by what it raised, of UNSOLVABLE."""
-    try:
-        if isinstance(found, Exception):
-            raise found
-        return problem_solution(problem, dataset, found)
-    except UNSOLVABLE as error:
-        reason = str(error).removeprefix(f"{dataset.name}: ")
-        if isinstance(error, np.linalg.LinAlgError):
-            reason = ("expected lengths and standard deviations that float64 can hold together; "
-                      f"some are so far from the others that matrices lose their digits ({reason})")
-        return Failure(problem, reason)
+def _failure(problem, dataset, error):
+    """The Failure of a problem by an `error` of UNSOLVABLE."""
+    reason = str(error).removeprefix(f"{dataset.name}: ")
+    if isinstance(error, np.linalg.LinAlgError):
+        reason = ("expected lengths and standard deviations that float64 can hold together; "
+                  f"some are so far from the others that matrices lose their digits ({reason})")
+    return Failure(problem, reason)
 
 
 def solutions(dataset: Dataset, problems: Collection[str] = PROBLEMS) -> list[Solution | Failure]:
@@ -203,20 +192,18 @@ def solutions(dataset: Dataset, problems: Collection[str] = PROBLEMS) -> list[So
         try:
             measured = dataset if problem == "problem4" else by_markers
             found = find(problem, measured, previous)
-        except UNSOLVABLE as error:
-            found = error
-        if problem == "problem3" and isinstance(found, SlamResult):
-            previous = found
-        solution = solved(problem, dataset, found)
-        if isinstance(solution, Solution):
+            if isinstance(found, SlamResult):
+                previous = found
+            solution = problem_solution(problem, dataset, found)
             solution.facts["seconds"] = time.perf_counter() - start
+        except UNSOLVABLE as error:
+            solution = _failure(problem, dataset, error)
         every.append(solution)
     return every
 
 
 def write_results(out: Path | str, problem: str, found, dataset: Dataset,
-                  truth: Truth | None = None, doubts: list[Doubt] | None = None
-                  ) -> Solution | Failure:
+                  truth: Truth | None = None) -> Solution | Failure:
     """Write what a solver found of one problem to the results folder `out` of a drive.
 
     The .mat files come first, summary.json last: a folder without it is unfinished. What it lists
@@ -227,11 +214,11 @@ def write_results(out: Path | str, problem: str, found, dataset: Dataset,
     problem : key of `PROBLEMS`.
     found : what `find` returns for the problem, or the exception, of UNSOLVABLE, that it raised.
     truth : Truth, to report errors, or None.
-    doubts : those about the files, or None to look for them.
 
     Returns
     -------
-    The Solution that is written, whose `doubts` say what contradicts the files, or a Failure.
+    The Solution that is written, whose `doubts` say what contradicts the files, or the Failure by
+    an exception. Raises UNSOLVABLE if a covariance is lost by rounding.
 
     >>> from slamlib.studies.simulation import simulate
     >>> dataset, truth = simulate("short", seed=1)
@@ -242,15 +229,16 @@ def write_results(out: Path | str, problem: str, found, dataset: Dataset,
     2000
     """
     out = Path(out)
-    solution = solved(problem, dataset, found)
-    if doubts is None:
-        doubts = doubts_before_solving(dataset)
+    if isinstance(found, Exception):
+        solution = _failure(problem, dataset, found)
+    else:
+        solution = problem_solution(problem, dataset, found)
     with files.locked(out):
         others = {}
         with suppress(DatasetError):
             others = results.read_summary(out)["problems"]
         others.pop(problem, None)
-        _write(out, dataset, truth, [solution], others, doubts)
+        _write(out, dataset, truth, [solution], others)
     return solution
 
 
@@ -270,57 +258,51 @@ def solve_to_folder(dataset: Dataset, truth: Truth | None, out: Path,
     files were read.
     """
     with files.locked(out):
-        doubts = doubts_before_solving(dataset)
-        return _write(out, dataset, truth, solutions(dataset, problems), {}, doubts)
+        return _write(out, dataset, truth, solutions(dataset, problems), {})
 
 
-def _write(out, dataset, truth, found, others, doubts):
+def _write(out, dataset, truth, found, others):
     """Write Solutions to a folder; return its summary, with the rows of `others`, too."""
     rows = others | {each.problem: summarize(each, truth) for each in found}
     (out / results.SUMMARY).unlink(missing_ok=True)
-    written = []
+    written = [file for problem in others for file in _result_files(out, problem)]
     for each in found:
         if isinstance(each, Solution):
             written += results.write_solution(out, each)
-    clear_results(out, written, keep=others)
-    summary = summary_of(dataset, truth, rows, [*doubts, *doubts_of_results(out)])
-    _write_estimated_vehicle(out / VEHICLE_ESTIMATED, dataset.vehicle, summary["problems"])
-    results.write_summary(out, summary)
-    return summary
+    return finish_results(out, written, dataset, truth, rows)
 
 
-def clear_results(out: Path, written: Collection[Path], keep: Iterable[str] = ()):
-    """Remove the files of earlier runs from a results folder whose summary is gone.
+def _result_files(out, problem):
+    """Paths of all files that a problem may have in a results folder."""
+    return [out / problem / name for name in results.RESULT_FILES]
 
-    The files `written` and those of the problems `keep` stay, and so do all other files and
-    folders.
+
+def finish_results(out: Path, written: Collection[Path], dataset: Dataset, truth: Truth | None,
+                   rows: dict) -> dict:
+    """Finish a results folder whose summary is gone; returns the new one.
+
+    Result files of earlier runs that are not among the `written` ones are removed; all other files
+    stay. The summary, by the rows (dict) of its problems and the doubts about the files, is written
+    last. It also doubts a fusion of problem 2 that contradicts problem 3 where both are there.
     """
-    files_of_runs = [out / VEHICLE_ESTIMATED]
-    for problem in PROBLEMS.keys() - keep:
-        files_of_runs += [out / problem / name for name in results.RESULT_FILES]
-    for file in files_of_runs:
-        if file not in written:
-            file.unlink(missing_ok=True)
-
-
-def doubts_of_results(out: Path) -> tuple[Doubt, ...]:
-    """A Doubt if problem 2's fusion contradicts problem 3 in a results folder that has both."""
+    for problem in PROBLEMS:
+        for file in _result_files(out, problem):
+            if file not in written:
+                file.unlink(missing_ok=True)
+    problems = {problem: rows[problem] for problem in PROBLEMS if problem in rows}
+    doubts = doubts_before_solving(dataset)
     with suppress(OSError):
         _, poses, covariances = results.read_structs(out / "problem2_fused", "vehiclePose")
         _, by_slam, _ = results.read_structs(out / "problem3", "vehiclePose")
-        return contradiction_doubts(poses, covariances, by_slam)
-    return ()
-
-
-def summary_of(dataset: Dataset, truth: Truth | None, rows: dict, doubts: list[Doubt]) -> dict:
-    """The summary of a drive, by the rows (dict) of its problems and doubts about its files."""
-    doubts = list(doubts)
-    problems = {problem: rows[problem] for problem in PROBLEMS if problem in rows}
+        doubts += contradiction_doubts(poses, covariances, by_slam)
     for row in problems.values():
         doubts += [Doubt(**doubt) for doubt in row["doubts"]]
-    return {"dataset": dataset.name, "poses": len(dataset.ticks),
-            "doubts": [asdict(doubt) for doubt in merged(doubts)],
-            "notes": all_notes(dataset, truth), "problems": problems}
+    _write_estimated_vehicle(out / VEHICLE_ESTIMATED, dataset.vehicle, problems)
+    summary = {"dataset": dataset.name, "poses": len(dataset.ticks),
+               "doubts": [asdict(doubt) for doubt in merged(doubts)],
+               "notes": dataset.notes + getattr(truth, "notes", ()), "problems": problems}
+    results.write_summary(out, summary)
+    return summary
 
 
 def summarize(solved: Solution | Failure, truth: Truth | None) -> dict:
@@ -328,16 +310,17 @@ def summarize(solved: Solution | Failure, truth: Truth | None) -> dict:
     title = PROBLEMS[solved.problem].title
     if isinstance(solved, Failure):
         return {"title": title, "doubts": [], "failed": solved.reason}
-    is_known = np.isfinite(solved.poses[:, 0])
-    sigmas = evaluation.sigmas(solved.covariances[is_known])
+    known = np.flatnonzero(np.isfinite(solved.poses[:, 0]))
+    world = int(known[0])
+    sigmas = evaluation.sigmas(solved.covariances[known])
     position_sigmas = sigmas[:, :2].max(axis=1)
     row = {"title": title, "doubts": [asdict(doubt) for doubt in solved.doubts],
-           "estimated_poses": len(sigmas), "world_is_pose": solved.world + 1,
+           "estimated_poses": len(sigmas), "world_is_pose": world + 1,
            "last_sigma_m": position_sigmas[-1], "median_sigma_m": np.median(position_sigmas),
            "median_sigma_heading_rad": np.median(sigmas[:, 2])}
     row |= solved.facts
     if truth is not None:
-        true = se2.between(truth.poses[solved.world], truth.poses)
+        true = se2.between(truth.poses[world], truth.poses)
         row["ate_m"] = evaluation.ate(solved.poses, true)
         row["ate_aligned_m"] = evaluation.ate(solved.poses, true, aligned=True)
         nees = evaluation.anees(solved.poses, solved.covariances, true)
@@ -365,31 +348,20 @@ def _write_estimated_vehicle(path, vehicle, rows):
     for name, fact in NOISE.items():
         if fact in learned and getattr(vehicle, name) is None:
             estimated[name] = learned[fact]
+    path.unlink(missing_ok=True)
     if estimated:
         write_vehicle(path, replace(vehicle, **estimated))
 
 
-def solve_folder(folder: Path | str, out: Path | str, problems: Collection[str] = (),
-                 verbose: bool = False) -> dict:
+def solve_folder(folder: Path, out: Path, problems: Collection[str] = ()) -> dict:
     """Read the dataset in a folder, solve it into the folder `out`; returns the summary.
 
-    What was read is printed to stderr.
-
-    Parameters
-    ----------
-    problems : keys of `PROBLEMS`, or none for all that the sensors allow.
-    verbose : True prints to stderr what is decided on the way.
-
-    Raises DatasetError if the dataset is malformed or does not allow a problem.
+    What was read is printed to stderr. `problems` are keys of `PROBLEMS`, or none for all that the
+    sensors allow. Raises DatasetError if the dataset is malformed or does not allow a problem.
     """
-    folder = Path(folder)
-    out = Path(out)
-    if verbose:
-        logging.basicConfig(format="%(message)s")
-        logging.getLogger("slamlib").setLevel(logging.INFO)
-    require(out.resolve() not in (folder.resolve(), folder.resolve() / "truth"), out,
-            "another folder for the results: this one is the dataset's")
     dataset = read_dataset(folder)
+    require(not out.resolve().is_relative_to(folder.resolve()), out,
+            "another folder for the results: this one is in the dataset's")
     truth = read_truth(folder)
     print("\n".join(inventory_lines(dataset, truth)), file=sys.stderr)
     for problem in problems:
@@ -398,8 +370,8 @@ def solve_folder(folder: Path | str, out: Path | str, problems: Collection[str] 
     return solve_to_folder(dataset, truth, out, problems or PROBLEMS)
 
 
-def solve_folders(folders: Sequence[Path | str], out: Path | str, jobs: int | None = None,
-                  **options) -> list[dict]:
+def solve_folders(folders: Sequence[Path], out: Path | str, jobs: int | None = None,
+                  problems: Collection[str] = ()) -> list[dict]:
     """Solve each of several datasets into out/<name>, and write the table out/drives.csv.
 
     One that cannot be read or written does not stop the others: its summary has the entry "error",
@@ -409,7 +381,7 @@ def solve_folders(folders: Sequence[Path | str], out: Path | str, jobs: int | No
     ----------
     jobs : datasets at a time, in as many processes; None for what joblib's `parallel_config` says,
         by default 1.
-    options : of `solve_folder`.
+    problems : as of `solve_folder`.
 
     Returns
     -------
@@ -418,24 +390,22 @@ def solve_folders(folders: Sequence[Path | str], out: Path | str, jobs: int | No
     from joblib import Parallel, delayed
 
     out = Path(out)
-    folders = [folder for folder in map(Path, folders) if not folder.is_file()]
+    folders = [folder for folder in folders if not folder.is_file()]
     by_name = {folder.absolute().name: folder for folder in folders}
     require(len(by_name) == len(folders), out,
             "datasets in folders of different names, as which their results are written")
-    solve = delayed(_summary_or_error)
+
+    def solve(name, folder):
+        try:
+            return solve_folder(folder, out / name, problems)
+        except (DatasetError, OSError) as error:
+            return {"dataset": name, "error": str(error), "doubts": [], "problems": {}}
+
     summaries = Parallel(n_jobs=jobs)(
-        solve(folder, out / name, **options) for name, folder in by_name.items())
+        delayed(solve)(name, folder) for name, folder in by_name.items())
     table = drive_table(summaries).to_csv(index=False)
     files.write_file(out / "drives.csv", table.encode())
     return summaries
-
-
-def _summary_or_error(folder, out, **options):
-    """What `solve_folder` returns, or a summary with an error."""
-    try:
-        return solve_folder(folder, out, **options)
-    except (DatasetError, OSError) as error:
-        return {"dataset": out.name, "error": str(error), "doubts": [], "problems": {}}
 
 
 def drive_table(summaries: Sequence[dict]):

@@ -125,7 +125,7 @@ def built_elsewhere(*arguments, **options):
 
     A large PDF leaves a fragmented heap, in which all numerics take a third longer.
     """
-    from slamlib.report import build_report
+    from slamlib.report.build import build_report
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
         return process.submit(build_report, *arguments, **options).result()
 

@@ -5,7 +5,8 @@ import pytest
 from nbformat.v4 import new_code_cell
 from test_report import make_data, write
 
-from slamlib.report import build_report, cache, document, execution
+from slamlib.report import cache, document, execution
+from slamlib.report.build import build_report
 
 
 def execute_without_kernel(books, data, datasets, results, finish):

@@ -130,13 +130,16 @@ def test_vehicle_defaults_are_table_2(folder):
 
 
 @pytest.mark.parametrize("content", [None, "", "\n\n", "# no rows\n  # none\n"])
-def test_absent_or_empty_sensors_are_none(folder, content):
-    for name in ("ArucoReading.txt", "UwbReading.txt", "UwbAntennaGuess.txt"):
+def test_absent_or_empty_sensors_are_none_and_of_the_empty_ones_it_is_said(folder, content):
+    names = "ArucoReading.txt", "UwbReading.txt", "UwbAntennaGuess.txt"
+    for name in names:
         (folder / name).unlink()
         if content is not None:
             write(folder / name, content)
     data = read_dataset(folder)
-    assert (data.aruco, data.uwb, data.antenna_guess, data.notes) == (None, None, None, ())
+    assert (data.aruco, data.uwb, data.antenna_guess) == (None, None, None)
+    told = () if content is None else names
+    assert data.notes == tuple(f"{name} has no rows of numbers." for name in told)
 
 
 def test_absent_maps_are_empty_and_the_true_vehicle_that_of_the_drive(folder):

@@ -75,7 +75,8 @@ def test_of_a_header_alone_there_is_no_row(folder):
     clean = read_dataset(folder)
     write(folder / "UwbReading.txt", "id_pose;id_beacon;r\n;;;\n")
     assert_same(read_dataset(folder), clean.without("uwb"),
-                "UwbReading.txt was read without its header line.")
+                "UwbReading.txt was read without its header line.",
+                "UwbReading.txt has no rows of numbers.")
 
 
 @pytest.mark.parametrize("text", [
@@ -94,6 +95,7 @@ MALFORMED = {
  |  | at least the row '1 0 0', found no rows
 # nothing¶¶ |  | at least the row '1 0 0', found no rows
 pose right left¶ |  | at least the row '1 0 0', found no rows
+1 0 0 |  | a row for each pose, as there are readings of sensors, found one row
 1 0 0¶2 5 | 2 | 3 numbers (pose id, right ticks, left ticks), found '2 5'
 ¶1 0¶2 0¶ | 2 | 3 numbers (pose id, right ticks, left ticks), found '1 0'
 \r\r1 0 0\r\r2 0\r | 5 | 3 numbers (pose id, right ticks, left ticks), found '2 0'
@@ -144,16 +146,16 @@ a;b¶¶1;3;nan;1¶1;3;2,5;1¶9;3;1,5;1 | 5 | pose id, a whole number from 1 to 4
 40 0 0 0¶40 0 0 0 | 2 | each id only once, found '40 0 0 0'
 """,
     "truth/vehicle.toml": """
-wheelbase = 0 |  | a number from 0.001 to 20 m for wheelbase, found '0'
+wheelbase = 0 | 1 | a number from 0.001 to 20 m for wheelbase, found '0'
 """,
     "vehicle.toml": """
-# a¶wheel_base = 1 |  | entries such as 'wheelbase = 0.4', found 'wheel_base'
-[wheelbases]¶x = 1 |  | entries such as 'wheelbase = 0.4', found 'wheelbases'
-left_radius = 'wide' |  | a number from 0.001 to 2.5 m for left_radius, found 'wide'
-left_radius = [0.1] |  | a number from 0.001 to 2.5 m for left_radius, found '[0.1]'
-left_radius = true |  | a number from 0.001 to 2.5 m for left_radius, found 'True'
-left_radius = nan |  | a number from 0.001 to 2.5 m for left_radius, found 'nan'
-left_radius = inf |  | a number from 0.001 to 2.5 m for left_radius, found 'inf'
+# a¶wheel_base = 1 | 2 | entries such as 'wheelbase = 0.4', found 'wheel_base'
+[wheelbases]¶x = 1 | 1 | entries such as 'wheelbase = 0.4', found 'wheelbases'
+# left_radius¶left_radius = 'wide' | 2 | a number from 0.001 to 2.5 m for left_radius, found 'wide'
+gate = true¶ "left_radius" = [0.1] | 2 | a number from 0.001 to 2.5 m for left_radius, found '[0.1]'
+left_radius = true | 1 | a number from 0.001 to 2.5 m for left_radius, found 'True'
+left_radius = nan | 1 | a number from 0.001 to 2.5 m for left_radius, found 'nan'
+left_radius = inf | 1 | a number from 0.001 to 2.5 m for left_radius, found 'inf'
 left_radius = 0,1 |  | TOML such as 'wheelbase = 0.4', found
 left_radius = |  | TOML such as 'wheelbase = 0.4', found
 gate = true¶gate = true |  | TOML such as 'wheelbase = 0.4', found
@@ -248,7 +250,8 @@ def test_without_guesses_problem_4_is_left_out_with_a_note(folder):
     (folder / "UwbAntennaGuess.txt").unlink()
     found = read_dataset(folder)
     assert_same(found, clean, "UwbAntennaGuess.txt is missing: problem 4 is left out.")
-    assert "drive: ranges: none" in inventory_lines(found, None)
+    assert inventory_lines(found, None)[0] == (
+        "drive: 4 poses, 3 sightings, 0 ranges, truth unknown")
 
 
 # Files of MATLAB.
@@ -284,11 +287,32 @@ def test_faults_in_a_mat_file_are_named_by_variable_and_row(folder):
 
 @pytest.mark.parametrize("content", [
     None, b"nonsense", b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + b"\0" * 99])
-def test_a_mat_file_that_cannot_be_read_is_listed(folder, content):
+def test_why_a_mat_file_is_not_read_is_said(folder, content):
     path = folder / "UwbReading.mat"
     os.mkfifo(path) if content is None else write(path, content)
     (folder / "UwbReading.txt").unlink()
-    assert read_dataset(folder).notes == ("Not read: 'UwbReading.mat'.",)
+    listed, reason = read_dataset(folder).notes
+    assert listed == "Not read: 'UwbReading.mat'."
+    assert reason.startswith(
+        "UwbReading.mat: expected a matrix named as UwbReading.txt of a file that 'save -v7' "
+        "wrote, found '")
+
+
+def test_a_mat_file_without_the_matrix_of_a_missing_file_is_told_with_what_it_has(folder):
+    (folder / "encoderReading.txt").unlink()
+    savemat(folder / "logs.mat", {"encoders": [[1, 0, 0]]})
+    assert error_of(read_dataset, folder).endswith(
+        "logs.mat: expected a matrix named as encoderReading.txt of a file that 'save -v7' wrote, "
+        "found 'encoders'.")
+
+
+def test_two_matrices_of_one_name_are_refused(folder):
+    (folder / "UwbReading.txt").unlink()
+    for name in "ab":
+        savemat(folder / f"{name}.mat", {"UwbReading": matrix("UwbReading.txt")})
+    assert error_of(read_dataset, folder) == (
+        f"{folder / 'b.mat'}, variable UwbReading: expected only one UwbReading.txt, found 'a.mat, "
+        "variable UwbReading'")
 
 
 # Arrays in place of files.
@@ -410,13 +434,13 @@ def test_datasets_are_the_folders_with_any_file_of_one_and_all_others_are_named(
 
 def test_what_was_found_is_said(folder):
     assert inventory_lines(read_dataset(folder), read_truth(folder)) == [
-        "drive: encoders: 4 poses",
-        "drive: sightings: 3 at 2 poses", "drive: ranges: 2 at 2 poses", "drive: truth: yes"]
+        "drive: 4 poses, 3 sightings, 2 ranges, truth known"]
 
 
 def test_what_was_not_found_is_said(folder):
     for name in ("ArucoReading.txt", "vehicle.toml"):
         (folder / name).unlink()
     write(folder / "UwbReading.txt", "# none\n")
-    assert inventory_lines(read_dataset(folder), None)[1:] == [
-        "drive: sightings: none", "drive: ranges: none", "drive: truth: no"]
+    assert inventory_lines(read_dataset(folder), None) == [
+        "drive: 4 poses, 0 sightings, 0 ranges, truth unknown",
+        "drive: note: UwbReading.txt has no rows of numbers."]

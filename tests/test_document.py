@@ -10,9 +10,8 @@ import pytest
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_output
 
 from slamlib.notebook.drives import plain
-from slamlib.report import NotebookError
 from slamlib.report.document import render
-from slamlib.report.notebooks import Options
+from slamlib.report.notebooks import NotebookError, Options
 
 ONE = Path("1_one.ipynb")
 TWO = Path("2_two.ipynb")

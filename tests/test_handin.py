@@ -108,12 +108,18 @@ def test_the_recorded_log_is_left_out_unless_report_toml_names_its_chapters():
 
 def summary_of(*problems, **others):
     """A summary of two poses, the first of which has no estimate by markers alone."""
-    poses = np.zeros((2, 3))
     covariances = np.tile(np.eye(3), (2, 1, 1))
-    rows = {problem: summarize(Solution(problem, poses, covariances,
-                                        world=int(problem == "problem2")), None)
-            for problem in problems}
+    rows = {}
+    for problem in problems:
+        poses = np.zeros((2, 3))
+        poses[0] = np.nan if problem == "problem2" else 0
+        rows[problem] = summarize(Solution(problem, poses, covariances), None)
     return {"dataset": "d", "poses": 2, "doubts": [], "notes": [], "problems": rows} | others
+
+
+def test_the_readme_explains_no_map_that_is_not_there():
+    text = handin.readme([summary_of("problem1")], Options())
+    assert "Map" not in text and "except in problem2" not in text
 
 
 def test_doubts_notes_and_failures_are_in_the_readme_and_empty_headings_are_not():

@@ -22,7 +22,7 @@ def drawn(count, rows, columns=2, labels=LABELS):
     for _, axes in plotting.each_drive("abc"[:count], rows, 4.0, columns=columns):
         for ax in np.atleast_1d(axes):
             for label in labels:
-                plotting.curve(ax, np.arange(9.0), "slam", label=label)
+                plotting.curve(ax, np.arange(9.0), "slam", np.arange(9), label)
     return plt.gcf()
 
 
@@ -51,6 +51,7 @@ def test_panels_are_side_by_side_under_their_titles_and_within_the_figure(count,
 def test_a_legend_has_each_label_once_and_fits(labels):
     fig = drawn(2, 2, labels=labels)
     fig.set_size_inches(3.9, 9.0)
+    fig.legends.clear()
     plotting.legend_below(fig)
     assert len(fig.legends) == 1
     assert [text.get_text() for text in fig.legends[0].get_texts()] == list(labels)
@@ -94,33 +95,36 @@ def drive_with(truth=True):
 
 
 @pytest.mark.parametrize("truth, rows", [(True, 2), (False, 2), (True, 1)])
-def test_errors_are_in_mm_and_without_truth_the_bands_stand_alone(truth, rows):
+def test_without_truth_the_bands_of_errors_stand_alone(truth, rows):
     """Those of the position only where there is one of axes."""
     result, drive = drive_with(truth)
     (_, axes), = plotting.each_drive([drive], rows=2)
     plotting.errors(axes[:rows], result, drive)
     assert axes[0].get_title("left") == drive.name
-    for ax, error, reach in zip(axes[:rows], (10, 2), (20 * REACH_95, 200)):
+    for ax, error, reach in zip(axes[:rows], (0.01, 0.002), (0.02 * REACH_95, 0.2)):
         assert [line.get_ydata() for line in ax.lines] == ([pytest.approx(error)] if truth else [])
         assert ax.collections[0].get_paths()[0].vertices[:, 1].max() == pytest.approx(reach)
 
 
-def test_bands_beyond_a_metre_and_long_axes_of_ellipses_are_in_metres():
-    result, drive = drive_with()
-    result.covariances = 1e4 * result.covariances
-    (_, axes), = plotting.each_drive([drive], rows=2)
-    plotting.errors(axes, result, drive, label="SLAM:")
-    assert axes[0].get_ylabel() == "position (m)"
-    assert axes[0].lines[0].get_ydata() == pytest.approx(0.01)
-    assert axes[0].lines[0].get_label() == "SLAM: error"
-    vertices = axes[0].collections[0].get_paths()[0].vertices
-    assert vertices[:, 1].max() == pytest.approx(2 * REACH_95)
+def units(axis):
+    """What the labels of ticks end in."""
+    plt.gcf().draw_without_rendering()
+    return {label.get_text().split()[-1] for label in axis.get_ticklabels()}
 
+
+def test_ticks_have_the_unit_of_their_size():
+    result, drive = drive_with()
+    for larger, position in ((1, "mm"), (1e6, "m")):
+        result.covariances = larger * result.covariances
+        (_, axes), = plotting.each_drive([drive], rows=2)
+        plotting.errors(axes, result, drive, label="SLAM:")
+        assert axes[0].lines[0].get_label() == "SLAM: error"
+        assert position in units(axes[0].yaxis) <= {position, "m"}
     ax = plotting.own_axes(plt.figure().subplots(), np.diag([0.01, 1])**2, np.array([[0.02, 3]]))
-    assert ax.get_xlabel().endswith("(m)") and ax.get_ylabel().endswith("(mm)")
-    assert np.abs(ax.lines[0].get_xydata()) == pytest.approx(np.array([[3, 20]]))
+    assert units(ax.xaxis) == {"m"} and "mm" in units(ax.yaxis)
+    assert np.abs(ax.lines[0].get_xydata()) == pytest.approx(np.array([[3, 0.02]]))
     assert ax.collections[0].get_paths()[0].vertices.max(axis=0) == pytest.approx(
-        [REACH_95, 10 * REACH_95])
+        [REACH_95, 0.01 * REACH_95])
 
 
 def test_errors_of_some_poses_are_in_the_frame_of_the_first_of_them():
@@ -131,5 +135,5 @@ def test_errors_of_some_poses_are_in_the_frame_of_the_first_of_them():
                            covariances=result.covariances[7::2])
     (_, axes), = plotting.each_drive([drive], rows=2)
     plotting.errors(axes, some, drive)
-    for ax, error in zip(axes, (10, 2)):
+    for ax, error in zip(axes, (0.01, 0.002)):
         assert ax.lines[0].get_ydata() == pytest.approx(error)

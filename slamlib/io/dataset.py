@@ -15,7 +15,15 @@ import numpy as np
 
 from slamlib.core import se2
 from slamlib.core.errors import require
-from slamlib.core.records import AntennaGuess, ArucoReadings, Dataset, Truth, UwbReadings
+from slamlib.core.records import (
+    NO_RANGES,
+    NO_SIGHTINGS,
+    AntennaGuess,
+    ArucoReadings,
+    Dataset,
+    Truth,
+    UwbReadings,
+)
 from slamlib.core.vehicle import TABLE_2, VEHICLE_LIMITS, Vehicle, changed
 from slamlib.io.files import write_file
 from slamlib.io.formats import (
@@ -93,6 +101,9 @@ def _dataset(files, vehicle, name, notes=()):
     encoders = read_table(files[ENCODER], ENCODER)
     encoders, ticks = _incremental_counts(encoders, vehicle)
     count = len(ticks)
+    has_readings = ARUCO in files or UWB in files
+    require(count > 1 or not has_readings, encoders.source,
+            "a row for each pose, as there are readings of sensors, found one row")
     sightings = read_table(files.get(ARUCO), ARUCO, count)
     guesses = read_table(files.get(GUESS), GUESS)
     ranges = read_table(files.get(UWB), UWB, count)
@@ -118,9 +129,12 @@ def _dataset(files, vehicle, name, notes=()):
 
 def read_vehicle(path: Path | None, default: Vehicle) -> Vehicle:
     """The Vehicle of a `vehicle.toml` or None, whose entries replace those of a default."""
-    if path is None:
-        return default
-    return changed(default, read_toml(path, "wheelbase = 0.4", VEHICLE_LIMITS), path)
+    vehicle = default
+    if path is not None:
+        entries, places = read_toml(path, "wheelbase = 0.4", VEHICLE_LIMITS)
+        for key, value in entries.items():
+            vehicle = changed(vehicle, {key: value}, places[key])
+    return vehicle
 
 
 def write_vehicle(path: Path, vehicle: Vehicle):
@@ -206,19 +220,13 @@ def read_truth(folder: Path | str) -> Truth | None:
                  vehicle, notes)
 
 
-def all_notes(dataset: Dataset, truth: Truth | None) -> tuple[str, ...]:
-    """Notes on what was mended or left out of a Dataset and its Truth."""
-    return dataset.notes if truth is None else dataset.notes + truth.notes
-
-
 def inventory_lines(dataset: Dataset, truth: Truth | None) -> list[str]:
-    """Lines on what was read of a Dataset and its Truth, with all notes."""
-    lines = [f"encoders: {len(dataset.ticks)} poses"]
-    for name, readings in (("sightings", dataset.aruco), ("ranges", dataset.uwb)):
-        if readings is None:
-            lines.append(f"{name}: none")
-        else:
-            lines.append(f"{name}: {len(readings.pose)} at {len(set(readings.pose))} poses")
-    lines.append("truth: no" if truth is None else "truth: yes")
-    lines += [f"note: {note}" for note in all_notes(dataset, truth)]
+    """A line on what was read of a Dataset and its Truth, and one for each note."""
+    sightings = (dataset.aruco or NO_SIGHTINGS).pose
+    ranges = (dataset.uwb or NO_RANGES).pose
+    truth_is = "unknown" if truth is None else "known"
+    lines = [f"{len(dataset.ticks)} poses, {len(sightings)} sightings, {len(ranges)} ranges, "
+             f"truth {truth_is}"]
+    notes = dataset.notes + getattr(truth, "notes", ())
+    lines += [f"note: {note}" for note in notes]
     return [f"{dataset.name}: {line}" for line in lines]

@@ -21,18 +21,16 @@ def locked(folder: Path) -> Iterator[None]:
     LOCK_TIME. The system releases it when the process that holds it ends.
     """
     file = folder / LOCK
+    lock = FileLock(file, timeout=LOCK_TIME)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        file.touch()
-    except OSError as error:
-        raise DatasetError(
-            f"{folder}: expected a folder to write to ({error.strerror})") from None
-    lock = FileLock(file)
-    try:
-        lock.acquire(timeout=LOCK_TIME)
+        lock.acquire()
     except Timeout:
         raise DatasetError(f"{folder}: expected no other run that writes here, and one did for "
                            f"{LOCK_TIME:g} s: try again when it has ended") from None
+    except OSError as error:
+        raise DatasetError(
+            f"{folder}: expected a folder to write to ({error.strerror})") from None
     try:
         yield
     finally:

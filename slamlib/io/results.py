@@ -22,14 +22,11 @@ FIELDS = {"vehiclePose": ("pose", "covari"), "ArucoMap": ("pose", "covari", "id"
           "UwbMap": ("position", "covariance", "id")}
 RESULT_FILES = tuple(f"{name}.mat" for name in FIELDS)  # of a problem's folder
 _HEADER = b"MATLAB 5.0 MAT-file, written by slamlib".ljust(116)  # scipy's contains the date
-FIELD_HEADER = "V56"  # bytes before the numbers of a field of a struct
-SIZE_WORD = 33  # of 4 bytes: the size of the array of structs
-COUNT_WORD = 41  # its number of columns
 
 
-def write_solution(folder: Path | str, solution) -> list[Path]:
+def write_solution(folder: Path, solution) -> list[Path]:
     """Write the .mat files of a Solution into folder/<problem>/, and return their paths."""
-    own = Path(folder) / solution.problem
+    own = folder / solution.problem
     poses = None, solution.poses, solution.covariances
     structs = {"vehiclePose": poses} | solution.maps
     for name, values in structs.items():
@@ -37,10 +34,10 @@ def write_solution(folder: Path | str, solution) -> list[Path]:
     return [own / f"{name}.mat" for name in structs]
 
 
-def write_summary(folder: Path | str, summary: dict):
+def write_summary(folder: Path, summary: dict):
     """Write the summary of a results folder, which is whole from then on."""
     text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False)
-    write_file(Path(folder) / SUMMARY, f"{text}\n".encode(errors="backslashreplace"))
+    write_file(folder / SUMMARY, f"{text}\n".encode(errors="backslashreplace"))
 
 
 def read_summary(folder: Path | str) -> dict:
@@ -67,14 +64,14 @@ def read_structs(folder: Path | str, name: str) -> tuple[np.ndarray, np.ndarray,
     >>> ids.tolist(), poses.shape, covariances.shape
     ([1, 2], (2, 3), (2, 3, 3))
     """
-    structs = loadmat(Path(folder) / f"{name}.mat")[name]
-    values = [np.array(structs[field].ravel().tolist()) for field in FIELDS[name]]
-    d = 2 if name == "UwbMap" else 3
-    places = values[0].reshape(-1, d)
-    covariances = values[1].reshape(-1, d, d)
-    if "id" in FIELDS[name]:
-        return values[2].ravel().astype(int), places, covariances
-    return np.arange(1, len(places) + 1), places, covariances
+    file = Path(folder) / f"{name}.mat"
+    structs = loadmat(file)[name].ravel()
+    place, covariance, *label = FIELDS[name]
+    places = np.concatenate(structs[place])
+    ids = np.arange(1, len(places) + 1)
+    if label:
+        ids = np.concatenate(structs["id"]).ravel().astype(int)
+    return ids, places, np.stack(structs[covariance])
 
 
 def write_structs(folder: Path | str, name: str, ids: np.ndarray | None, places: np.ndarray,
@@ -84,32 +81,15 @@ def write_structs(folder: Path | str, name: str, ids: np.ndarray | None, places:
     `name` is a key of FIELDS. The ids (n,) of maps ascend, those of vehicle poses are not written;
     `places` are poses (n, 3), of markers with headings in (-pi, pi], or positions (n, 2);
     `covariances` are (n, 3, 3) or (n, 2, 2). They are NaN where there is no estimate.
-
-    scipy writes many structs slowly, one by one. Here it writes one of zeros, whose bytes are
-    repeated with the numbers: each field is a header of 56 bytes and its numbers by columns. The
-    array's size and number of columns are set (MAT-File Format, version 5).
     """
-    count, d = np.shape(places)
-    zeros = {}
-    numbers = {}
-    entries = []
-    for field, values, shape in zip(
-            FIELDS[name], (places, covariances, ids), ((1, d), (d, d), (1, 1))):
-        zeros[field] = np.zeros(shape)
-        numbers[field] = np.reshape(values, (count, *shape))
-        entries += [(f"header of {field}", FIELD_HEADER), (field, "=f8", shape[::-1])]  # by columns
-    layout = np.dtype(entries)
+    fields = FIELDS[name]
+    structs = np.empty((1, len(places)), [(field, object) for field in fields])
+    for field, values in zip(fields, (places, covariances, ids)):
+        structs[field][0] = [*np.asarray(values, float)]
     buffer = BytesIO()
-    savemat(buffer, {name: zeros})
-    content = bytearray(buffer.getvalue())
-    content[:len(_HEADER)] = _HEADER
-    structs = np.repeat(np.frombuffer(content[-layout.itemsize:], layout), count)
-    for field, values in numbers.items():
-        structs[field] = np.swapaxes(values, 1, 2)
-    words = np.frombuffer(content, "=i4", COUNT_WORD + 1)
-    words[SIZE_WORD] += (count - 1) * layout.itemsize
-    words[COUNT_WORD] = count
-    write_file(Path(folder) / f"{name}.mat", content[:-layout.itemsize] + structs.tobytes())
+    savemat(buffer, {name: structs})
+    content = buffer.getvalue()[len(_HEADER):]
+    write_file(Path(folder) / f"{name}.mat", _HEADER + content)
 
 
 def write_tum(path: Path | str, poses: np.ndarray):
@@ -120,12 +100,10 @@ def write_tum(path: Path | str, poses: np.ndarray):
     1 0 0 0 0 0 0 1
     3 2.5 0 0 0 0 0 1
     """
-    x, y, heading = poses.T
     ids = np.arange(1, len(poses) + 1)
-    zero = np.zeros(len(poses))
-    qz = np.sin(heading / 2)
-    qw = np.cos(heading / 2)
-    rows = np.column_stack([ids, x, y, zero, zero, zero, qz, qw])
+    no_z_qx_qy = np.zeros_like(poses)
+    half = poses[:, 2] / 2
+    rows = np.column_stack([ids, poses[:, :2], no_z_qx_qy, np.sin(half), np.cos(half)])
     text = BytesIO()
-    np.savetxt(text, rows[np.isfinite(x)], fmt="%.17g")
+    np.savetxt(text, rows[np.isfinite(half)], fmt="%.17g")
     write_file(Path(path), text.getvalue())

@@ -155,6 +155,8 @@ def _table_of_text(path, columns, may_have_z):
     table = Table(path, np.array(numbers).reshape(-1, count), np.array(lines))
     if how:
         table = table.noted(f" was read {' and '.join(sorted(how))}")
+    if not numbers:
+        table = table.noted(" has no rows of numbers")
     return table
 
 
@@ -163,23 +165,30 @@ def contents(folder: Path | str, expected: tuple[str, ...] = DATASET_FILES,
     """Sources (dict of Path or Table) of the files of a folder by name, and notes.
 
     Raises DatasetError if the folder cannot be read, the file `required` is missing, or two files
-    have one of the names `expected`.
+    or matrices have one of the names `expected`.
     """
     folder = Path(folder)
     paths = _listed(folder)
+    sources = [(name, path) for path in paths for name in expected
+               if re.fullmatch(Path(name).stem + ENDING, path.name, re.IGNORECASE)]
+    found = dict(sources)
+    missing = [name for name in LIMITS if name in expected and name not in found]
+    reasons = []
+    for path in paths:
+        if missing and path.suffix.lower() == ".mat":
+            matrices, reason = _matrices(path, missing)
+            sources += matrices
+            if not matrices:
+                reasons.append(reason)
     files = {}
-    for path in paths:
-        for name in expected:
-            if re.fullmatch(Path(name).stem + ENDING, path.name, re.IGNORECASE):
-                require(name not in files, path, f"only one {name}", files.get(name, path).name)
-                files[name] = path
-    for path in paths:
-        missing = [name for name in LIMITS if name in expected and name not in files]
-        files |= _matrices(path, missing)
+    for name, source in sources:
+        earlier = files.setdefault(name, source)
+        require(earlier is source, folder / source.name, f"only one {name}", earlier.name)
     notes = [f"{source.name} was read as {name}." for name, source in files.items()
              if source.name.lower() != name.lower()]
     used = [source.name.split(",")[0] for source in files.values()]
-    not_read = _not_read([path for path in paths if path.name not in used])
+    others = [path for path in paths if path.name not in used]
+    not_read = _not_read(others) + reasons
     if required is not None:
         told = " ".join(["this file, found none.", *not_read])
         require(required in files, folder / required, told)
@@ -187,29 +196,30 @@ def contents(folder: Path | str, expected: tuple[str, ...] = DATASET_FILES,
 
 
 def _matrices(path, names):
-    """Tables (dict by name) of the matrices of a .mat file that have the stems of `names`."""
-    tables = {}
-    if path.suffix.lower() != ".mat" or not path.is_file():
-        return tables
+    """Pairs (list) of one of `names` and the Table of the matrix so named, and why if none is."""
+    by_stem = {Path(name).stem.lower(): name for name in names}
     try:
-        variables = loadmat(path)
-    except Exception:  # scipy raises many kinds about other versions and bytes
-        return tables
-    for variable, value in variables.items():
-        for name in names:
-            if variable.lower() == Path(name).stem.lower():
-                source = f"{path}, variable {variable}"
-                tables[name] = table_of_array(source, value, LIMITS[name])
-    return tables
+        require(path.is_file(), path, "a file that can be read")
+        found = loadmat(path)
+    except Exception as error:  # scipy raises many kinds about other versions and bytes
+        found = {str(error): None}
+    tables = []
+    for variable, value in found.items():
+        name = by_stem.get(variable.lower())
+        if name:
+            source = f"{path}, variable {variable}"
+            tables.append((name, table_of_array(source, value, LIMITS[name])))
+    told = ", ".join(variable for variable in found if not variable.startswith("__"))
+    return tables, (f"{path.name}: expected a matrix named as {' or '.join(names)} of a file that "
+                    f"'save -v7' wrote, found {told!r}.")
 
 
-def datasets_in(data: Path | str, names: list[str] | None = None) -> tuple[list[str], list[str]]:
+def datasets_in(data: Path, names: list[str] | None = None) -> tuple[list[str], list[str]]:
     """Names of the datasets in a folder, and sentences on what else is there.
 
     They are all sub-folders with files of a dataset, or those that `names` selects. Raises
     DatasetError if there is none, or no sub-folder of a selected name.
     """
-    data = Path(data)
     paths = [path for path in _listed(data) if path.name != "README.md"]
     found = [path.name for path in paths if path.is_dir() and contents(path)[0]]
     require(found, data, f"this folder, with a sub-folder with an {ENCODER} for each dataset, "

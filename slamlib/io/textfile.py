@@ -15,8 +15,8 @@ _COMMENT_OR_QUOTE = r'(#|%|//).*|"'
 _BLANKS_AT_SEPARATOR = r"(?<=[,;])[^\S\n]+|(?<!\s)[^\S\n]+(?=[,;])"
 
 
-def read_toml(path: Path, example: str, known) -> dict:
-    """Entries of a TOML file without tables.
+def read_toml(path: Path, example: str, known) -> tuple[dict, dict]:
+    """Entries of a TOML file without tables, and their places, file and line, by the same keys.
 
     Raises DatasetError, which quotes the `example` of an entry, if the file is not TOML, or has a
     key that is not among the `known` ones.
@@ -26,9 +26,18 @@ def read_toml(path: Path, example: str, known) -> dict:
         entries = tomllib.loads(text)
     except (ValueError, RecursionError) as failure:
         raise DatasetError(f"{path}: expected TOML such as '{example}', found: {failure}") from None
-    for key in entries:
-        require(key in known, path, f"entries such as '{example}'", key)
-    return entries
+    places = {key: _place(path, text, key) for key in entries}
+    for key, place in places.items():
+        require(key in known, place, f"entries such as '{example}'", key)
+    return entries, places
+
+
+def _place(path, text, key):
+    """The path and, where it can be told, the line of a key."""
+    for line, row in enumerate(text.split("\n"), start=1):
+        if re.match(rf"[^\w#]*{re.escape(key)}\b", row):
+            return f"{path}, line {line}"
+    return path
 
 
 def read_text(path: Path) -> str:

@@ -5,11 +5,9 @@ from slamlib.notebook.tabular import (
     accuracy,
     antenna_rows,
     calibration_rows,
-    gate_row,
-    learned_row,
     map_accuracy,
     table,
 )
 
-__all__ = ["Drive", "accuracy", "antenna_rows", "attempt", "calibration_rows", "gate_row",
-           "learned_row", "map_accuracy", "show_doubts", "start", "table", "write_results"]
+__all__ = ["Drive", "accuracy", "antenna_rows", "attempt", "calibration_rows", "map_accuracy",
+           "show_doubts", "start", "table", "write_results"]

@@ -15,7 +15,7 @@ from pathlib import Path
 from IPython.display import Markdown, display
 
 from slamlib import solve
-from slamlib.core.errors import DatasetError, require
+from slamlib.core.errors import require
 from slamlib.core.records import Dataset, Truth
 from slamlib.io.dataset import read_dataset, read_truth
 from slamlib.io.tables import datasets_in
@@ -45,13 +45,17 @@ class Drive:
         return doubts_before_solving(self.dataset)
 
 
-def read_drives(data: Path, names: Iterable[str]) -> list[Drive]:
+def read_drives(data: Path, selected: list[str] | None = None) -> list[Drive]:
     """List of the Drives with these names in a data folder, recorded ones first, then by length.
 
-    Raises DatasetError if a dataset does not follow the format.
+    Without names they are all, but simulated ones only where no other is there. Raises DatasetError
+    if a dataset is not there or does not follow the format.
     """
-    drives = [Drive(name, read_dataset(data / name), read_truth(data / name)) for name in names]
-    return sorted(drives, key=lambda drive: (drive.origin == "simulated", len(drive.dataset.ticks)))
+    names, _ = datasets_in(data, selected)
+    folders = [data / name for name in names]
+    drives = [Drive(each.name, read_dataset(each), read_truth(each)) for each in folders]
+    drives.sort(key=lambda drive: (drive.origin == "simulated", len(drive.dataset.ticks)))
+    return drives if selected else without_stand_ins(drives)
 
 
 def without_stand_ins(drives: list[Drive]) -> list[Drive]:
@@ -60,38 +64,39 @@ def without_stand_ins(drives: list[Drive]) -> list[Drive]:
 
 
 def start(sensor: str | None = None) -> list[Drive]:
-    """List of the drives with a sensor, "aruco" or "uwb", as `read_drives` sorts them.
+    """List of the drives with a sensor, "aruco" or "uwb", as `read_drives` has them.
 
-    Simulated drives are left out where there are recorded ones. The environment variable
-    SLAMLIB_DATA names the data folder; by default it is the nearest `data` in this folder or above
-    it. SLAMLIB_DATASETS selects datasets by name, one a line. Also sets the style of the figures.
+    The environment variable SLAMLIB_DATA names the data folder; by default it is the nearest `data`
+    in this folder or above it. SLAMLIB_DATASETS selects datasets by name, one a line. Also sets the
+    style of the figures.
     Raises DatasetError if a dataset does not follow the format, or none has the sensor.
     """
     plotting.use_style()
-    data = _data_folder()
-    selected = os.environ.get("SLAMLIB_DATASETS")
-    names, _ = datasets_in(data, selected.split("\n") if selected else None)
-    drives = read_drives(data, names)
-    if not selected:
-        drives = without_stand_ins(drives)
+    selected = os.environ.get("SLAMLIB_DATASETS", "")
+    drives = read_drives(_data_folder(), selected.splitlines())
     if sensor:
         drives = [drive for drive in drives if getattr(drive.dataset, sensor) is not None]
-    require(drives, data, f"a dataset with {solve.SENSORS.get(sensor)}, found none")
+    require(drives, _data_folder(), f"a dataset with {solve.SENSORS.get(sensor)}, found none")
     return drives
 
 
 def write_results(drive: Drive, problem: str, found) -> None:
     """Write what a solver found of a problem to the results of a Drive, and say what is doubted.
 
-    `problem` is a key of `solve.PROBLEMS`, `found` as `solve.find` returns it. The environment
-    variable SLAMLIB_RESULTS names the folder of results; by default it is `results` beside the
-    data folder. Raises DatasetError, which `attempt` tells, if `found` is no solution.
+    `problem` is a key of `solve.PROBLEMS`, `found` as `solve.find` returns it, or the exception
+    that it raised, which is said. The environment variable SLAMLIB_RESULTS names the folder of
+    results; by default it is `results` beside the data folder. Raises what `attempt` tells if
+    `found` is no solution.
     """
-    solved = _written(drive, problem, found)
+    results = Path(os.environ.get("SLAMLIB_RESULTS") or _data_folder().parent / "results")
+    solved = solve.write_results(
+        results / drive.name, problem, found, drive.dataset, drive.truth)
     if isinstance(solved, solve.Failure):
-        raise DatasetError(solved.reason)
-    told = merged([*drive.doubts, *solved.doubts])
-    show_doubts(drive, [doubt for doubt in told if doubt not in drive.doubts])
+        title = solve.PROBLEMS[problem].title
+        _say(drive, f"The problem “{title}” could not be solved: {solved.reason}.")
+    else:
+        told = merged([*drive.doubts, *solved.doubts])
+        show_doubts(drive, [doubt for doubt in told if doubt not in drive.doubts])
 
 
 @contextmanager
@@ -106,16 +111,7 @@ def attempt(drive: Drive, problem: str | None = None) -> Iterator[None]:
         if problem is None:
             _say(drive, f"left out here: {error}.")
         else:
-            failure = _written(drive, problem, error)
-            title = solve.PROBLEMS[problem].title
-            _say(drive, f"The problem “{title}” could not be solved: {failure.reason}.")
-
-
-def _written(drive, problem, found):
-    """The Solution or the Failure that is written of what a solver found, or raised."""
-    results = Path(os.environ.get("SLAMLIB_RESULTS") or _data_folder().parent / "results")
-    return solve.write_results(
-        results / drive.name, problem, found, drive.dataset, drive.truth, drive.doubts)
+            write_results(drive, problem, error)
 
 
 def show_doubts(drive: Drive, doubts: Iterable[solve.Doubt]) -> None:
@@ -139,9 +135,6 @@ def plain(text: str) -> str:
 
 def _data_folder():
     """The folder that SLAMLIB_DATA names, or `data`, here or beside the folder of notebooks."""
-    stated = os.environ.get("SLAMLIB_DATA")
-    if stated:
-        return Path(stated)
-    if Path("data").is_dir():
-        return Path("data")
-    return Path("..", "data")
+    here = Path("data")
+    nearest = here if here.is_dir() else Path("..", "data")
+    return Path(os.environ.get("SLAMLIB_DATA", nearest))

@@ -36,12 +36,12 @@ def whole_map(drive, result) -> Figure:
     if truth is not None:
         plotting.trajectory(ax, truth.poses, "truth", linewidth=0.7)
     if len(result.marker):
-        plotting.draw_markers(ax, result.marker_in_world, result.marker_covariance, enlarged)
+        plotting.ellipses(ax, result.marker_in_world, result.marker_covariance,
+                          plotting.ROLES["aruco"]["color"], enlarged=enlarged)
+        plotting.landmarks(ax, result.marker_in_world, "marker", "markers")
         if truth is not None:
             plotting.landmarks(ax, truth.marker_in_world, "true place", "markers: truth")
-    ranged = None
     if len(result.antenna):
-        ranged = drive.dataset.uwb.antenna
         guess = drive.dataset.antenna_guess
         guess = plotting.places_by_id(guess.antenna, guess.position, result.antenna)
         in_doubt = np.isin(result.antenna, list(result.doubts))
@@ -51,11 +51,9 @@ def whole_map(drive, result) -> Figure:
             plotting.landmarks(ax, truth.antenna_in_world, "true place", "antennas: truth")
     plotting.legend_below(fig)
     fig.draw_without_rendering()                                  # fixes the axes for the names
-    seen = result.sightings.marker[~result.rejected]
     taken = []
-    for kind, letter, size, doubtful, measured in (
-            ("antenna", "A", 9.0, result.doubts, ranged),
-            ("marker", "", 7.0, result.unconfirmed, seen)):
+    for kind, letter, size, doubtful in (
+            ("antenna", "A", 9.0, result.doubts), ("marker", "", 7.0, result.unconfirmed)):
         ids = getattr(result, kind)
         places = getattr(result, f"{kind}_in_world")[:, :2]
         sigmas = 1e3 * position_sigmas(getattr(result, f"{kind}_covariance"))
@@ -66,9 +64,8 @@ def whole_map(drive, result) -> Figure:
             if letter or each in doubtful or len(ids) <= MOST_NAMES:
                 _write_name(ax, place, name, size, taken)
             # Pages tell the name of this invisible disc: report.lua makes a title of it.
-            count = np.sum(measured == each)
             ax.plot(*place, "o", alpha=0, markersize=9, zorder=9,
-                    gid=f"tip: {kind} {each}, σ {sigma:.2g} mm, {count} measurements")
+                    gid=f"tip: {kind} {each}, σ {sigma:.2g} mm")
     return fig
 
 

@@ -19,6 +19,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
 from matplotlib_inline.backend_inline import set_matplotlib_formats
 
 from slamlib.core import se2
@@ -54,8 +55,6 @@ ROLES = {
 STYLE = Path(__file__).with_name("slamlib.mplstyle")  # for matplotlib.style
 MAX_SEMI_AXIS = 0.08         # of enlarged 95 % ellipses, in the larger extent of the path
 MAX_BANDS = 800              # poses at which errors are drawn
-PER_METRE = {"m": 1.0, "mm": 1e3}
-MIN_POINT_VARIANCE = 1.0     # rad^2, variance of the heading of a marker without orientation
 
 
 class Estimates(NamedTuple):
@@ -120,65 +119,57 @@ def with_ellipses(ax: Axes, poses: np.ndarray, covariances: np.ndarray, role: st
                   label: str, enlarged: float, count: int = 12) -> Axes:
     """Draw a path with at most `count` filled 95 % ellipses, enlarged as a title says."""
     some = evenly(poses, count)
+    color = ROLES[role]["color"]
     trajectory(ax, poses, role, label, linewidth=1.2, alpha=0.8)
-    ellipses(ax, poses[some], covariances[some], ROLES[role]["color"], fill=0.5, enlarged=enlarged)
+    ellipses(ax, poses[some], covariances[some], color, fill=0.5, enlarged=enlarged)
     ax.set_title(f"95 % ellipses × {enlarged}", loc="right", fontweight="normal")
     return ax
 
 
-def errors(axes: Sequence[Axes], result, drive, role: str = "slam", label: str = "",
-           unit: str | None = None) -> Sequence[Axes]:
+def errors(axes: Sequence[Axes], result, drive, role: str = "slam", label: str = ""
+           ) -> Sequence[Axes]:
     """Draw errors of a result along the path: of position, and in a second one of axes of heading.
 
     The bands are the longest semi-axis of the 95 % ellipse and ±2 sigma of the heading; without
     truth they stand alone. `result` as of `estimates`. `label` goes before the texts in the legend.
-    `unit` of the position is "mm" or "m"; None takes the latter if the band reaches further than
-    1 m.
     """
     found = estimates(result, drive)
     some = slice(None, None, 1 + len(found.frame) // MAX_BANDS)
     frame = found.frame[some]
     C = found.covariances[some]
-    semi_axis = longest_semi_axes(C)                                     # m
-    unit = unit or _unit(semi_axis.max())
-    scale = PER_METRE[unit]
-    two_sigma = 2e3 * np.sqrt(C[:, 2, 2])                                # mrad
-    for ax, name, low, high in zip(axes, (f"position ({unit})", "δ (mrad)"),
-                                   (0, -two_sigma), (scale * semi_axis, two_sigma)):
+    two_sigma = 2 * np.sqrt(C[:, 2, 2])
+    for ax, name, unit, low, high in zip(axes, ("position", "δ"), ("m", "rad"), (0, -two_sigma),
+                                         (longest_semi_axes(C), two_sigma)):
         ax.fill_between(frame + 1, low, high, color=ROLES[role]["color"], alpha=0.18, linewidth=0,
                         label=f"{label} 95 % by the covariance".strip())
-        ax.set(ylabel=name)
+        ax.set_ylabel(name)
+        ax.yaxis.set_major_formatter(EngFormatter(unit))
     if found.true is not None:
         error = se2.difference(found.poses, found.true)[some]
-        distance = scale * np.hypot(error[:, 0], error[:, 1])
-        for ax, values in zip(axes, (distance, 1e3 * error[:, 2])):
+        distance = np.hypot(error[:, 0], error[:, 1])
+        for ax, values in zip(axes, (distance, error[:, 2])):
             curve(ax, values, role, frame, f"{label} error".strip(), linewidth=1.0)
     axes[0].set_ylim(0, None)
     axes[-1].set(xlabel="pose id")
     return axes
 
 
-def _unit(length):
-    """The unit, "m" or "mm", in which a length in m has a number of at most 1000."""
-    return "m" if length > 1.0 else "mm"
-
-
 def own_axes(ax: Axes, covariance: np.ndarray, points: np.ndarray, **look) -> Axes:
     """Draw the 95 % ellipse of a covariance (>= 2, >= 2) by odometry along its own axes.
 
-    Each axis has its own scale and unit, so that a needle becomes an ellipse. Crosses are `points`
+    Each axis has its own scale, so that a needle becomes an ellipse. Crosses are `points`
     (m, >= 2) relative to its centre, in m, in the axes of the covariance.
     """
     variances, directions = np.linalg.eigh(covariance[:2, :2])
-    variances = variances[::-1]                                          # along, across
+    in_own_axes = np.diag(variances[::-1])                               # along, across
     places = points[:, :2] @ directions[:, ::-1]
-    reach = np.vstack([np.abs(places), REACH_95 * np.sqrt(np.maximum(variances, 0))])
-    along, across = map(_unit, reach.max(axis=0))
-    scale = np.array([PER_METRE[along], PER_METRE[across]])
-    in_own_axes = np.diag(scale**2 * variances)
-    ellipses(ax, np.zeros((1, 2)), in_own_axes[None], ROLES["odometry"]["color"])
-    ax.plot(*(scale * places).T, **ROLES["true place"] | look)
-    ax.set(xlabel=f"along the ellipse ({along})", ylabel=f"across ({across})")
+    centre = np.zeros((1, 2))
+    color = ROLES["odometry"]["color"]
+    ellipses(ax, centre, in_own_axes[None], color)
+    ax.plot(places[:, 0], places[:, 1], **ROLES["true place"] | look)
+    ax.set(xlabel="along the ellipse", ylabel="across")
+    for axis in (ax.xaxis, ax.yaxis):
+        axis.set_major_formatter(EngFormatter("m"))
     return ax
 
 
@@ -209,16 +200,6 @@ def ellipses(ax: Axes, positions: np.ndarray, covariances: np.ndarray, color: st
                                      linewidths=0.9, zorder=3.5))
     ax.autoscale_view()
     return ax
-
-
-def draw_markers(ax: Axes, in_world: np.ndarray, covariances: np.ndarray,
-                 enlarged: float = 1) -> Axes:
-    """Draw markers in_world (k, 3) as squares, with ticks along their headings, and ellipses."""
-    ellipses(ax, in_world, covariances, ROLES["aruco"]["color"], enlarged=enlarged)
-    x, y, heading = in_world[covariances[:, 2, 2] < MIN_POINT_VARIANCE].T
-    ax.quiver(x, y, np.cos(heading), np.sin(heading), color="#555555", scale=45, width=2e-3,
-              headwidth=0, headlength=0, headaxislength=0, zorder=4)
-    return landmarks(ax, in_world, "marker", "markers")
 
 
 def draw_antennas(ax: Axes, positions: np.ndarray, covariances: np.ndarray,
@@ -254,7 +235,8 @@ def enlargement(poses: np.ndarray, covariances: np.ndarray) -> int:
     """The factor of one digit with which the largest 95 % ellipse has MAX_SEMI_AXIS, at least 1."""
     known = np.isfinite(poses[:, 0])
     extent = np.ptp(poses[known, :2], axis=0).max()
-    factor = MAX_SEMI_AXIS * extent / longest_semi_axes(covariances[known]).max()
+    largest = longest_semi_axes(covariances[known]).max()
+    factor = MAX_SEMI_AXIS * extent / largest
     return max(1, int(float(f"{factor:.0e}")))
 
 
@@ -269,16 +251,12 @@ def legend_below(fig: Figure) -> None:
     """Draw one legend below all axes of a figure: each label once."""
     entries = {label: handle for ax in fig.axes
                for handle, label in zip(*ax.get_legend_handles_labels())}
-    fig.legends.clear()
-    if entries:
-        fig.legend(entries.values(), entries.keys(), loc="outside lower center",
-                   ncols=int(fig.get_figwidth() / 1.8))        # inches, of a label
+    columns = int(fig.get_figwidth() / 1.8)                  # inches, of a label
+    fig.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=columns)
 
 
-def curve(ax: Axes, values: np.ndarray, role: str, frame: np.ndarray | None = None,
-          label: str | None = None, **look) -> Axes:
+def curve(ax: Axes, values: np.ndarray, role: str, frame: np.ndarray, label: str | None = None,
+          **look) -> Axes:
     """Draw values (n,) over the pose id; `frame` (n,) are the indices from 0 of their poses."""
-    if frame is None:
-        frame = np.arange(len(values))
     ax.plot(frame + 1, values, label=label or role, **ROLES[role] | look)
     return ax

@@ -2,16 +2,14 @@
 
 import re
 from collections.abc import Iterable, Iterator
-from itertools import pairwise
 
 import numpy as np
+import pandas as pd
 from IPython.display import Markdown
 
 from slamlib.core import evaluation, se2
-from slamlib.core.sightings import GATE
 from slamlib.notebook.plotting import estimates, places_by_id
 from slamlib.robust.calibration import RANGES, WHEELS
-from slamlib.robust.solution import solved_noise
 
 DASH = "–"
 # What begins a cell of a column of numbers, or is an italic remark in it.
@@ -25,39 +23,30 @@ def table(rows: Iterable[dict]) -> Markdown:
     error, and the median in brackets. None, NaN and absent keys are dashes; columns of nothing else
     are left out. Of consecutive rows with the same first cell only the first shows it.
     """
-    columns = _columns(rows)
+    texts = [{name: cell(value) for name, value in row.items()} for row in rows]
+    columns = pd.DataFrame(texts).fillna(DASH)
+    columns = columns.loc[:, (columns != DASH).any()]
+    if columns.empty:
+        return Markdown(DASH)
     rules = []
-    for texts in columns.values():
-        numeric = all(map(NUMERIC.match, texts))
-        rules.append("---:" if numeric else "---")
-    first, *others = columns.values()
-    if others:
-        first = ["" if text == above else text for above, text in pairwise([None, *first])]
-    lines = [columns, rules, *zip(first, *others)]
-    return Markdown("\n".join("| " + " | ".join(line) + " |" for line in lines))
-
-
-def _columns(rows):
-    """The texts of a table's columns, {header: list of str}, or one dash if there are none."""
-    rows = [{name: cell(value).replace(" ± ", "\u00a0±\u00a0") for name, value in row.items()}
-            for row in rows]
-    columns = {}
-    for name in dict.fromkeys(name for row in rows for name in row):
-        column = [row.get(name, DASH) for row in rows]
-        if set(column) != {DASH}:
-            columns[name] = column
-    return columns or {DASH: [DASH]}
+    for name in columns:
+        is_numeric = columns[name].str.match(NUMERIC).all()
+        rules.append("---:" if is_numeric else "---")
+    if len(rules) > 1:
+        first = columns.iloc[:, 0]
+        columns.isetitem(0, first.mask(first == first.shift(), ""))
+    lines = [columns, rules, *columns.to_numpy()]
+    text = "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    return Markdown(text.replace(" ± ", "\u00a0±\u00a0"))
 
 
 def cell(value) -> str:
     """Text (str) of a value of `table`."""
     if isinstance(value, str):
         return value
-    if value is None:
-        return DASH
     if np.ndim(value):
         return _over_drives(np.asarray(value, float))
-    if np.isnan(value):
+    if pd.isna(value):
         return DASH
     if isinstance(value, int | np.integer):
         return f"{value:,}"
@@ -69,32 +58,37 @@ def number(value: float, decimals: int | None = None) -> str:
     if abs(value) > 1e6:                       # the method failed
         return "> 10⁶"
     if decimals is None:
-        decimals = _decimals(value, 3, at_most=6) if value else 0
+        decimals = _decimals(value, 3) if value else 0
     return f"{value:z,.{decimals}f}".replace("-", "−")
 
 
-def _decimals(value, digits, at_most):
-    """Number (int) of decimals that show this number of significant digits of a value."""
+def _decimals(value, digits):
+    """Number (int) of decimals, at most 7, with this number of significant digits of a value."""
     exponent = np.floor(np.log10(abs(value)))
-    return int(np.clip(digits - 1 - exponent, 0, at_most))
+    return int(np.clip(digits - 1 - exponent, 0, 7))
 
 
 def estimate(value: float, sigma: float) -> str:
     """Text (str) of a value ± its standard deviation, which has two digits."""
-    decimals = _decimals(sigma, 2, at_most=7) if sigma else 2
-    return f"{value:.{decimals}f} ± {sigma:.{decimals}f}".replace("-", "−")
+    decimals = _decimals(sigma, 2) if sigma else 2
+    return f"{number(value, decimals)} ± {number(sigma, decimals)}"
 
 
 def _over_drives(values):
     """Mean ± standard error and median of values (s,), one a drive."""
-    error = 0.0
-    if len(values) > 1:
-        error = values.std(ddof=1) / np.sqrt(len(values))
-    decimals = _decimals(error, 2, at_most=3) if error > 0 else None
-    text = number(values.mean(), decimals)
+    error = pd.Series(values).sem()
     if error > 0:
-        text += f" ± {number(error, decimals)}"
-    return f"{text} ({number(np.median(values), decimals)})"
+        decimals = _decimals(error, 2)
+        return f"{estimate(values.mean(), error)} ({number(np.median(values), decimals)})"
+    return f"{number(values.mean())} ({number(np.median(values))})"
+
+
+def true_places(drive, kind: str, ids: np.ndarray) -> np.ndarray:
+    """True places (k, c) of landmarks (k,) of a `kind`, NaN where a Drive does not know them."""
+    if drive.truth is None:
+        return np.full((len(ids), 2), np.nan)
+    places = getattr(drive.truth, f"{kind}_in_world")
+    return places_by_id(getattr(drive.truth, kind), places, ids)
 
 
 def accuracy(result, drive) -> dict:
@@ -125,44 +119,14 @@ def map_accuracy(result, drive, kind: str) -> dict:
     if not len(ids):
         return {}
     covariances = getattr(result, f"{kind}_covariance")
-    row = {f"{kind}s": len(ids),
-           "their σ (mm)": 1e3 * np.median(evaluation.position_sigmas(covariances))}
-    true_ids = getattr(drive.truth, kind, ())
-    if np.isin(ids, true_ids).all():
+    position_sigma = evaluation.position_sigmas(covariances)
+    row = {f"{kind}s": len(ids), "their σ (mm)": 1e3 * np.median(position_sigma)}
+    true = true_places(drive, kind, ids)
+    if np.isfinite(true).all():
         places = getattr(result, f"{kind}_in_world")
-        true = places_by_id(true_ids, getattr(drive.truth, f"{kind}_in_world"), ids)
         off = se2.difference(places, true) if kind == "marker" else places - true
-        row["error (mm)"] = 1e3 * np.sqrt(np.mean(np.sum(off[:, :2]**2, axis=1)))
+        row["error (mm)"] = 1e3 * evaluation.ate(places, true)
         row["their NEES"] = np.nanmean(se2.squared_norms(off, covariances))
-    return row
-
-
-def learned_row(result, drive) -> dict:
-    """Row of `table` on what a SlamResult learned of a Drive's noise."""
-    slip_sigma, factor_sigma, _ = result.noise_sigma
-    slip = 1e3 * result.slip
-    factor = result.noise.sightings
-    return {"dataset": drive.name, "slip (mm)": estimate(slip, slip * slip_sigma),
-            "in GTSAM": 1e3 * solved_noise(result.fit).slip,
-            "factor": estimate(factor, factor * factor_sigma), "step": result.model}
-
-
-def gate_row(result, drive) -> dict:
-    """Row of `table` on the sightings that a SlamResult of a Drive rejects.
-
-    By the truth of their markers, how many of the rejected ones are right, within GATE of the true
-    sighting, and how many that are not are missed.
-    """
-    s = result.sightings
-    count = result.rejected.sum()
-    row = {"dataset": drive.name, "rejected": f"{count:,} of {len(s.marker):,}"}
-    truth = drive.truth
-    if truth is not None and np.isin(s.marker, truth.marker).all():
-        places = places_by_id(truth.marker, truth.marker_in_world, s.marker)
-        z = se2.between(truth.poses[s.frame[s.row]], places)
-        is_right = se2.squared_distances(s.z, z, s.C) < GATE
-        row["right"] = np.sum(result.rejected & is_right)
-        row["missed"] = np.sum(~result.rejected & ~is_right)
     return row
 
 
@@ -178,16 +142,17 @@ def calibration_rows(result, drive) -> Iterator[dict]:
             stated = f"{entry['stated']:g}"
             if entry["stated_sigma"]:
                 stated += f" ± {entry['stated_sigma']:.3g}"
+            estimated = estimate(entry["estimate"], entry["sigma"])
             row = {"dataset": drive.name, "entry": f"`{entry['name']}`",
-                   "unit": entry["unit"] or DASH, "stated": stated,
-                   "estimated": estimate(entry["estimate"], entry["sigma"])}
+                   "unit": entry["unit"] or None, "stated": stated, "estimated": estimated}
             if k < WHEELS.stop and drive.origin == "simulated":
                 row["true"] = f"{getattr(drive.truth.vehicle, entry['name']):.6g}"
             yield row | {"used": "estimate" if entry["released"] else "both"}
     if has_ranges and not drive.dataset.vehicle.range_noise_factor:
         factor = result.noise.ranges
-        yield {"dataset": drive.name, "entry": "`range_noise_factor`", "unit": DASH,
-               "estimated": estimate(factor, factor * result.noise_sigma[2]), "used": "estimate"}
+        sigma = factor * result.noise_sigma[2]
+        yield {"dataset": drive.name, "entry": "`range_noise_factor`",
+               "estimated": estimate(factor, sigma), "used": "estimate"}
 
 
 def antenna_rows(result, drive) -> Iterator[dict]:
@@ -197,14 +162,11 @@ def antenna_rows(result, drive) -> Iterator[dict]:
     ranges that keep less than half of their weight.
     """
     ids = result.antenna
-    truth = drive.truth
     guess = drive.dataset.antenna_guess
     guess = places_by_id(guess.antenna, guess.position, ids)
-    moved = np.linalg.norm(result.antenna_in_world - guess, axis=1)
-    true = np.full_like(result.antenna_in_world, np.nan)
-    if truth is not None:
-        true = places_by_id(truth.antenna, truth.antenna_in_world, ids)
-    error = result.antenna_in_world - true
+    moved = 1e3 * np.linalg.norm(result.antenna_in_world - guess, axis=1)
+    error = result.antenna_in_world - true_places(drive, "antenna", ids)
+    distance = 1e3 * np.linalg.norm(error, axis=1)
     squared = se2.squared_norms(error, result.antenna_covariance)
     sigmas = evaluation.sigmas(result.antenna_covariance)
     for k, antenna in enumerate(ids.tolist()):
@@ -213,7 +175,7 @@ def antenna_rows(result, drive) -> Iterator[dict]:
             name += "?"
         x, y = map(estimate, result.antenna_in_world[k], sigmas[k])
         own = drive.dataset.uwb.antenna == antenna
+        is_light = result.range_weight[own] < 0.5
         yield {"dataset": drive.name, "antenna": name, "x (m)": x, "y (m)": y,
-               "from the guess (mm)": 1e3 * moved[k],
-               "error (mm)": 1e3 * np.linalg.norm(error[k]), "d²": squared[k],
-               "down-weighted (%)": 100 * np.mean(result.range_weight[own] < 0.5)}
+               "from the guess (mm)": moved[k], "error (mm)": distance[k], "d²": squared[k],
+               "down-weighted (%)": 100 * is_light.mean()}

@@ -8,16 +8,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import joblib
+import nbformat
 
 from slamlib.core.errors import DatasetError, require
 from slamlib.io import files
 from slamlib.io.dataset import inventory_lines
-from slamlib.io.results import SUMMARY, read_summary, write_summary
+from slamlib.io.results import SUMMARY, read_summary
 from slamlib.io.tables import datasets_in
-from slamlib.notebook.drives import read_drives, without_stand_ins
+from slamlib.notebook.drives import read_drives
 from slamlib.report import cache
 from slamlib.report.notebooks import Options, read_books
-from slamlib.solve import SENSORS, clear_results, doubts_of_results, summary_of
+from slamlib.solve import SENSORS, finish_results
 
 # Name of the file in a report that has a digest and lists its files; all others are the user's.
 PAGES = ".pages"
@@ -73,15 +74,14 @@ def _read(data, selected):
     for name in names:
         require(DATASET_NAME.fullmatch(name), data / name, "letters from a to z, digits, spaces, "
                 "dots, dashes and underscores in its name: rename this folder")
-    found = read_drives(data, names)
-    drives = found if selected else without_stand_ins(found)
+    drives = read_drives(data, selected)
     lines = []
     for drive in drives:
         lines += inventory_lines(drive.dataset, drive.truth)
-    omitted = [drive.name for drive in found if drive not in drives]
+    omitted = set(names) - {drive.name for drive in drives}
     if omitted:
-        lines.append(f"left out, because simulated: {', '.join(omitted)} (name all datasets to "
-                     "have them)")
+        lines.append(f"left out, because simulated: {', '.join(sorted(omitted))} (name all "
+                     "datasets to have them)")
     _say("\n".join(lines + unread))
     return drives
 
@@ -112,7 +112,8 @@ def _execute(books, drives, data, kept):
 
     def finish(source, executed, seconds):
         folder = kept / source.stem
-        cache.keep(folder, keys[source], executed)
+        content = nbformat.writes(executed)
+        files.write_file(folder / f"{keys[source]}.ipynb", content.encode())
         cache.recall(folder, keys[source], books[source])
         say(source, f"executed in {seconds:.1f} s")
 
@@ -144,11 +145,7 @@ def _write_results(drive, stages, folder):
                 if file.is_file() and file.name != SUMMARY:
                     written.append(folder / file.relative_to(own))
                     files.write_file(written[-1], file.read_bytes())
-        clear_results(folder, written)
-        doubts = [*drive.doubts, *doubts_of_results(folder)]
-        summary = summary_of(drive.dataset, drive.truth, rows, doubts)
-        write_summary(folder, summary)
-    return summary
+        return finish_results(folder, written, drive.dataset, drive.truth, rows)
 
 
 def _write_pages(books, keys, drives, summaries, options, results, report):

@@ -16,7 +16,6 @@ import joblib
 import nbformat
 from nbformat import NotebookNode
 
-from slamlib.io.files import write_file
 from slamlib.report.notebooks import Books, code_cells
 
 SLAMLIB = Path(__file__).parents[1]
@@ -51,8 +50,3 @@ def recall(folder: Path, key: str, book: NotebookNode) -> bool:
     for cell, old in zip(code_cells(book), code_cells(executed), strict=True):
         cell.outputs = old.outputs
     return True
-
-
-def keep(folder: Path, key: str, executed: NotebookNode):
-    """Keep an executed notebook, whose results are in its folder."""
-    write_file(folder / f"{key}.ipynb", nbformat.writes(executed).encode())

@@ -18,10 +18,9 @@ from urllib.parse import quote
 
 import pypandoc
 import typst
-from jinja2 import Template
 from nbconvert.filters import strip_ansi
 
-from slamlib.report.notebooks import Books, NotebookError, Options, title_of
+from slamlib.report.notebooks import Books, NotebookError, Options, rendered, title_of
 
 HERE = Path(__file__).parent
 DIALECT = "gfm-alerts-autolink_bare_uris-emoji-yaml_metadata_block+raw_attribute"
@@ -54,9 +53,8 @@ def render(books: Books, options: Options) -> dict[str, bytes]:
 
 def markdown(book, on_paper: bool = False) -> str:
     """Return a notebook with its outputs and pictures as Markdown."""
-    text = (HERE / "notebook.md").read_text(encoding="utf-8")
-    template = Template(text, trim_blocks=True, lstrip_blocks=True)
-    return template.render(book=book, on_paper=on_paper, address=address, strip_ansi=strip_ansi)
+    return rendered("notebook.md", book=book, on_paper=on_paper, address=address,
+                    strip_ansi=strip_ansi)
 
 
 def address(kind: str, data: str) -> str:

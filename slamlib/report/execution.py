@@ -5,10 +5,11 @@ import os
 import time
 from collections.abc import Callable
 from copy import deepcopy
+from functools import partialmethod
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from jupyter_client import AsyncKernelManager
+from jupyter_client import AsyncKernelClient, AsyncKernelManager
 from jupyter_client.kernelspec import KernelSpecManager
 from nbclient import NotebookClient
 from nbclient.exceptions import CellExecutionError
@@ -21,6 +22,12 @@ JOBS = 2      # notebooks at a time
 # Pages are equal every time. The matrices are small: more threads cost time.
 DEFAULTS = {"SOURCE_DATE_EPOCH": "0", "PYTHONHASHSEED": "0", "OPENBLAS_NUM_THREADS": "1",
             "OMP_NUM_THREADS": "1"}
+
+
+class _Client(AsyncKernelClient):
+    """Has no heartbeat: its thread may wake up after its socket was closed with the kernel."""
+
+    start_channels = partialmethod(AsyncKernelClient.start_channels, hb=False)
 
 
 class _Loop(asyncio.SelectorEventLoop):
@@ -70,7 +77,7 @@ async def _execute_all(books, environment, results, finish):
 async def _execute(source, book, environment):
     """Execute one notebook in place with this interpreter."""
     manager = AsyncKernelManager(
-        kernel_name="python3",
+        kernel_name="python3", client_factory=_Client,
         kernel_spec_manager=KernelSpecManager(kernel_dirs=[]))  # no kernels of the user are found
     client = NotebookClient(
         book, km=manager, resources={"metadata": {"path": str(source.parent)}},

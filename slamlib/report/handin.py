@@ -6,15 +6,12 @@ from io import BytesIO
 from pathlib import Path
 from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 
-from jinja2 import Template
-
 from slamlib.io import files
 from slamlib.io.results import RESULT_FILES, read_summary
 from slamlib.report.build import Report
-from slamlib.report.notebooks import Options
+from slamlib.report.notebooks import Options, rendered
 from slamlib.solve import PROBLEMS, SENSORS
 
-README = Path(__file__).with_name("readme.txt")  # a template of Jinja
 CHAPTERS = ("[0-9A]*",)  # the problems, and the appendix on which they rely
 # The folders that are handed in, with problem 2 from markers alone, and fused as its improvement.
 HANDED = ("problem1", "problem2", "problem2_fused", "problem3", "problem4")
@@ -52,7 +49,6 @@ def write_zip(path: Path, report: Report, results: Path, options: Options):
 
 def readme(summaries: list[dict], options: Options) -> str:
     """Return README.txt of drives with these summaries."""
-    template = Template(README.read_text(encoding="utf-8"), trim_blocks=True)
-    text = template.render(
-        cover=options, drives=summaries, handed=HANDED, problems=PROBLEMS, sensors=SENSORS)
+    text = rendered("readme.txt", cover=options, drives=summaries, handed=HANDED,
+                    problems=PROBLEMS, sensors=SENSORS)
     return re.sub("\n{3,}", "\n\n", text.strip()) + "\n"

@@ -10,6 +10,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 import nbformat
+from jinja2 import Template
 from nbformat import NotebookNode
 
 from slamlib.core.errors import require
@@ -35,23 +36,22 @@ class Options:
     chapters: tuple[str, ...] = ()  # names of notebooks, also as "[1-4]*"; empty: all
 
 
-def read_options(path: str | Path) -> Options:
+def read_options(path: Path) -> Options:
     """Return the Options that a file describes; without it, the defaults.
 
     DatasetError if the file is not TOML, has an unknown key, or a value is not as it must be.
     """
-    path = Path(path)
     if not path.exists():
         return Options()
     keys = [option.name for option in fields(Options)]
-    entries = read_toml(path, 'author = "Ada Lovelace"', keys)
+    entries, places = read_toml(path, 'author = "Ada Lovelace"', keys)
     chapters = entries.pop("chapters", [])
     is_list = isinstance(chapters, list) and all(isinstance(name, str) for name in chapters)
-    require(is_list, path, 'a list of notebooks in quotes, such as ["1_odometry", "A_studies"], '
-            'for chapters', chapters)
+    require(is_list, places.get("chapters"), 'a list of notebooks in quotes, such as '
+            '["1_odometry", "A_studies"], for chapters', chapters)
     for key, value in entries.items():
         is_line = type(value) in (str, int) and re.fullmatch(r"[^\n\ufffd]*", str(value))
-        require(is_line, path, f"a line of UTF-8 text in quotes for {key}", value)
+        require(is_line, places[key], f"a line of UTF-8 text in quotes for {key}", value)
         entries[key] = str(value)
     return Options(**entries, chapters=tuple(chapters))
 
@@ -60,6 +60,12 @@ def notebooks_folder() -> Path:
     """Return the folder `notebooks` if it is there, else the one beside slamlib's sources."""
     here = Path("notebooks")
     return here if here.is_dir() else Path(__file__).parents[2] / here
+
+
+def rendered(template: str, **values) -> str:
+    """Return the text of a template of Jinja, a file beside this one, with these values."""
+    text = Path(__file__).with_name(template).read_text(encoding="utf-8")
+    return Template(text, trim_blocks=True, lstrip_blocks=True).render(values)
 
 
 def read_books(folder: Path, chapters: tuple[str, ...] = ()) -> Books:

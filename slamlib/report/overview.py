@@ -11,7 +11,6 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 from IPython.core.pylabtools import print_figure
-from jinja2 import Template
 from matplotlib.figure import Figure
 from nbformat import NotebookNode
 from nbformat.v4 import new_markdown_cell, new_notebook
@@ -24,9 +23,9 @@ from slamlib.io.results import FIELDS, read_structs, read_summary
 from slamlib.notebook import Drive, plotting, table
 from slamlib.notebook.drives import plain, without_stand_ins
 from slamlib.report.document import address
+from slamlib.report.notebooks import rendered
 from slamlib.solve import PROBLEMS, SENSORS, VEHICLE_ESTIMATED, Solution
 
-TEXT = Path(__file__).with_name("overview.md")
 DRAWN = "problem1", "problem2_fused"  # whose trajectories figure 1 has, beside the last one
 # Columns of the table of results, in thousandths of these entries of a summary.
 COLUMNS = {"ATE (mm)": "ate_m", "aligned (mm)": "ate_aligned_m", "at returns (mm)": "at_returns_m",
@@ -51,8 +50,7 @@ def solved_drive(drive: Drive, results: Path) -> SolvedDrive:
             found = {name: read_structs(results / problem, name) for name in FIELDS
                      if (results / problem / f"{name}.mat").exists()}
             _, poses, covariances = found.pop("vehiclePose")
-            world = row["world_is_pose"] - 1
-            solutions.append(Solution(problem, poses, covariances, world, found))
+            solutions.append(Solution(problem, poses, covariances, found))
     estimated = results / VEHICLE_ESTIMATED
     vehicle = read_vehicle(estimated if estimated.exists() else None, drive.dataset.vehicle)
     return SolvedDrive(drive.name, drive.dataset, drive.truth, solutions, summary, vehicle)
@@ -63,11 +61,10 @@ def opening(drives: list[SolvedDrive]) -> NotebookNode:
     solved = [drive for drive in drives if drive.solutions]
     longest = without_stand_ins(solved)[-1] if solved else None
     drawn = trajectories(longest) if longest else ""
-    template = Template(TEXT.read_text(encoding="utf-8"), trim_blocks=True, lstrip_blocks=True)
-    text = template.render(
-        drives=drives, longest=longest, plain=plain, sensors=SENSORS,
-        picture=address("image/svg+xml", drawn),
-        results=table(row for drive in drives for row in result_rows(drive)).data)
+    rows = [row for drive in drives for row in result_rows(drive)]
+    text = rendered(
+        "overview.md", drives=drives, longest=longest, plain=plain, sensors=SENSORS,
+        picture=address("image/svg+xml", drawn), results=table(rows).data)
     return new_notebook(cells=[new_markdown_cell(text)])
 
 

@@ -22,7 +22,6 @@ end
 
 local function raw(text) return pandoc.RawBlock(FORMAT, text) end
 local function as_it_is(element) return element, false end
-local function none() return {} end
 
 -- The label of an anchor; those of Typst must be unique in the document.
 local function label(chapter, id)
@@ -33,7 +32,6 @@ local function address(chapter, id)
   local file = not typst and chapter ~= options.here and options.files[chapter] or ""
   return file .. (id == "" and not typst and "" or "#" .. label(chapter, id))
 end
-
 local function attributes(id, classes) return pandoc.Attr(label(options.here, id), classes or {}) end
 
 local function picture(image)
@@ -59,7 +57,6 @@ local function is_picture(block)
   return block.tag == "Para" and #block.content == 1
     and (block.content[1].tag == "Image" or block.content[1].tag == "RawInline")
 end
-
 local function caption_of(block)
   if block.tag ~= "Para" then return end
   local kind, number = (stringify(block) .. " "):match "^(%u%l+) ([%dA-Z]+%.?%d*)%.%s"
@@ -120,7 +117,6 @@ local function escaped(str)
   local number = typst and str.text:match "^(%d+)%.$"
   if number then return {pandoc.Str(number), pandoc.RawInline("typst", "\\.")} end
 end
-
 local function is_empty(cell) return stringify(cell.contents) == "" end
 
 -- The rows of a table: one that begins with an empty cell continues the group above, and one that
@@ -166,7 +162,6 @@ end
 local function outside_of_formula(str)
   if str.text:find "^\\begin{" then refuse("a formula stands outside of $$: " .. str.text) end
 end
-
 local function reference(kind, number)
   local id = kind .. "-" .. number
   local chapter = options.targets[id]
@@ -225,7 +220,7 @@ local function with_captions(blocks)
       result:insert(captioned(result, block, kind, number))
     elseif block.tag == "RawBlock" and block.text:find "<table" then
       result:extend(pandoc.read(block.text, "html").blocks:walk{
-        Div = function(div) return div.content end, RawInline = none, Table = grouped})
+        Div = function(div) return div.content end, RawInline = function() return {} end, Table = grouped})
     elseif typst and block.tag == "Para" and stringify(block):find ":$" then -- stays with the next
       result:insert(pandoc.Div({block}, {["typst:sticky"] = "true"}))
     else

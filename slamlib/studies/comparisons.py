@@ -84,11 +84,6 @@ def by_marker(choose: Callable) -> Callable:
     return start
 
 
-def first_sighting(places, covariances):
-    """(3,) where the first sighting places the marker."""
-    return places[0]
-
-
 def most_certain(places, covariances):
     """(3,) where the most certain sighting places it."""
     return places[np.linalg.slogdet(covariances).logabsdet.argmin()]
@@ -122,8 +117,9 @@ def map_of_problem_2(measurements: Measurements, in_world: np.ndarray,
     return markers
 
 
-LANDMARKS = {"first sighting": by_marker(first_sighting), "most certain": by_marker(most_certain),
-             "median": by_marker(median), "mean by information": by_marker(mean_by_information),
+LANDMARKS = {"first sighting": by_marker(lambda places, _: places[0]),
+             "most certain": by_marker(most_certain), "median": by_marker(median),
+             "mean by information": by_marker(mean_by_information),
              "consensus": consensus_markers, "problem 2's map": map_of_problem_2}
 CONFUSIONS = "none", "random", "in frame", "twins"        # of `simulation.confuse_labels`
 # Scales of the Cauchy kernels before the last one, by the name of the rounds.
@@ -152,7 +148,7 @@ def confusions(seed: int, **options) -> dict:
         last = replace(problem, accepted=accept_all(m, cauchy))
         row = np.searchsorted(truth.marker, m.marker)
         true = state_from_arrays(m, truth.poses[m.frame], truth.marker_in_world[row],
-                                 np.zeros((0, 2)), m.calibration.stated)
+                                 truth.antenna_in_world[:0], m.calibration.stated)
         right = optimize(last, true).state.markers
         for name, place in LANDMARKS.items():
             state = odometry_state(m, "arc", markers=place)

@@ -8,7 +8,7 @@ test has it, `rows` computes the first two seeds of each again and compares.
 
 import os
 import platform
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 
@@ -25,24 +25,22 @@ SMALLEST = 1e-6         # m, or a share: smaller differences do not count
 COMPUTING = ("core", "robust", "studies")     # packages on which rows depend
 
 
-def run(trial: Callable, seeds: Iterable[int], **options) -> pd.DataFrame:
+def run(trial: Callable, seeds: Sequence[int], **options) -> pd.DataFrame:
     """DataFrame of what trial(seed, **options) returns, a dict, with one row for each seed.
 
     More than two seeds are shared among all processors.
     """
-    seeds = list(seeds)
     processes = -1 if len(seeds) > 2 else 1
     found = joblib.Parallel(processes)(joblib.delayed(trial)(seed, **options) for seed in seeds)
-    return pd.DataFrame(found, index=pd.Index(seeds, name="seed"))
+    return pd.DataFrame(found, seeds).rename_axis("seed")
 
 
-def rows(name: str, trial: Callable, seeds: Iterable[int], **options) -> pd.DataFrame:
+def rows(name: str, trial: Callable, seeds: Sequence[int], **options) -> pd.DataFrame:
     """What `run` returned when `make studies` wrote the file studies/`name`.csv.
 
     Raises DatasetError if there is no such file, or it is of another trial, options or seeds; and
     AssertionError if a seed that is computed again has other numbers.
     """
-    seeds = list(seeds)
     file = FOLDER / f"{name}.csv"
     call = f"# {trial.__name__}, {options}\n"
     mode = os.environ.get("SLAMLIB_STUDIES")
@@ -50,10 +48,10 @@ def rows(name: str, trial: Callable, seeds: Iterable[int], **options) -> pd.Data
         text = run(trial, seeds, **options).to_csv(float_format="%.7g", lineterminator="\n")
         write_file(file, f"{made_by()}{call}{text}".encode())
     found = pd.DataFrame()
-    if file.exists() and call in file.read_text(encoding="utf-8"):
+    if file.exists() and call in file.read_text():
         found = pd.read_csv(file, comment="#", index_col="seed")
-    require(list(found.index) == seeds, file, f"rows of {trial.__name__} by the seeds and options "
-            "of this call, as 'make studies' writes them; studies.run computes others")
+    require(list(found.index) == list(seeds), file, f"rows of {trial.__name__} by the seeds and "
+            "options of this call, as 'make studies' writes them; studies.run computes others")
     if mode == "check":
         again = run(trial, seeds[:2], **options)
         pd.testing.assert_frame_equal(found.loc[again.index], again, check_dtype=False,

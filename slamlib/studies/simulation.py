@@ -184,7 +184,6 @@ def write_dataset(folder: str | Path, dataset: Dataset, truth: Truth | None = No
         _write_table(folder / "UwbAntennaGuess.txt", "%d %.3f %.3f", guess.antenna, guess.position)
     if truth is not None:
         folder = folder / "truth"
-        folder.mkdir()
         write_vehicle(folder / VEHICLE, truth.vehicle)
         _write_table(folder / "vehiclePose.txt", "%d %.6f %.6f %.6f", number, truth.poses)
         _write_table(folder / "ArucoMap.txt", "%d %.6f %.6f %.6f",
