@@ -56,7 +56,8 @@ def handed(tmp_path_factory):
 @pytest.mark.slow
 def test_the_names_are_the_assignment_s_and_the_files_are_the_results(handed):
     folder, archive = handed
-    files = ["problem1/vehiclePose.mat", "problem2_fused/vehiclePose.mat", "problem4/UwbMap.mat",
+    files = ["problem1/vehiclePose.mat", "problem2_hint/vehiclePose.mat",
+             "problem2_fused/vehiclePose.mat", "problem4/UwbMap.mat",
              *(f"problem{n}/{name}.mat" for n in (2, 3, 4) for name in ("ArucoMap", "vehiclePose"))]
     assert archive.namelist() == sorted(
         ["README.txt", "report.pdf", *(f"mine/{name}" for name in files)])
@@ -78,7 +79,8 @@ def test_the_readme_is_true_of_the_files(handed):
     text = handed[1].read("README.txt").decode()
     one_line = re.sub(r"\s+", " ", text)
     for part in ("Ada", "mine/problem2_fused: odometry + ArUco 40 of 40 poses have an estimate",
-                 "mine/problem4: SLAM with UWB ranges 40 of 40", "fused with the odometry",
+                 "mine/problem2_hint: odometry + ArUco, hint 40 of 40", "are far too small",
+                 "mine/problem4: SLAM with UWB ranges 40 of 40", "fusion with the odometry",
                  "In mine/problem2 this is pose 11", "are NaN"):
         assert part in one_line
     assert max(map(len, text.split("\n"))) <= 100 and text.endswith("\n")
@@ -131,10 +133,12 @@ def test_doubts_notes_and_failures_are_in_the_readme_and_empty_headings_are_not(
     for part in ("d: Lengths are in mm.", "d: A header was left out.",
                  "d/problem2 (ArUco) is not here: it needs markers.",
                  "d/problem3 (problem3) could not be solved: no landmark.",
+                 "d/problem2_hint (problem2_hint) could not be solved: not told.",
                  "/problem4 (SLAM with UWB ranges) is not here: it needs UWB ranges."):
         assert part in text
-    assert text.startswith(f"{Options().title} A C ") and "not told" not in text
-    assert not re.search("Doubts|Notes", handin.readme([summary_of("problem1")], Options()))
+    assert text.startswith(f"{Options().title} A C ")
+    by_wheels = handin.readme([summary_of("problem1")], Options())
+    assert not re.search("Doubts|Notes|problem2_fused is|problem2_hint does", by_wheels)
 
 
 def test_results_of_a_run_that_was_killed_are_not_handed_in(tmp_path):

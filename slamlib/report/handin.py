@@ -13,8 +13,8 @@ from slamlib.report.notebooks import Options, rendered
 from slamlib.solve import PROBLEMS, SENSORS
 
 CHAPTERS = ("[0-9A]*",)  # the problems, and the appendix on which they rely
-# The folders that are handed in, with problem 2 from markers alone, and fused as its improvement.
-HANDED = ("problem1", "problem2", "problem2_fused", "problem3", "problem4")
+# The folders that are handed in: of problem 2 from markers alone, and both fusions that improve it.
+HANDED = ("problem1", "problem2", "problem2_hint", "problem2_fused", "problem3", "problem4")
 
 
 def hand_in_options(options: Options) -> Options:
