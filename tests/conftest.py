@@ -138,15 +138,11 @@ def report_on_all(tmp_path_factory, kept):
     """
     import numpy as np
 
-    from slamlib.io.dataset import read_dataset, read_truth
     from slamlib.studies.simulation import manoeuvre, simulate, write_dataset
     folder = tmp_path_factory.mktemp("built")
     data = folder / "data"
-    long = ROOT / "data" / "long"
     shutil.copytree(ROOT / "data", data, ignore=lambda *_: ["long"])
-    truth = read_truth(long)
-    write_dataset(data / "long", read_dataset(long).first(900),
-                  replace(truth, poses=truth.poses[:900]))
+    write_dataset(data / "long", *simulate("long", 2, poses=900, late_ranges=0.05))
     new, truth = simulate("short", 77, poses=300, late_ranges=0.15)
     bare = new.without("aruco").without("uwb")
     sparse = new.aruco.pose % 150 == 0

@@ -4,12 +4,14 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+from joblib import parallel_config
 from scipy.stats import t
 
-from slamlib import estimate
+from slamlib import estimate, studies
 from slamlib.core import se2
 from slamlib.core.evaluation import anees, ate, nees, nees_band
 from slamlib.core.records import ArucoReadings
+from slamlib.robust.solution_doubts import solution_doubts
 from slamlib.studies.montecarlo import antenna_error
 from slamlib.studies.simulation import PATHS, simulate
 
@@ -21,6 +23,12 @@ def short(seed, poses=None, path="short", rounds=1, **options):
     PATHS["rounds"] = replace(layout, turns=turns, poses=rounds * layout.poses)
     dataset, truth = simulate("rounds", seed, poses=poses, **options)
     return replace(dataset, name=path), truth
+
+
+def trials(trial, seeds, **options):
+    """`studies.run` in this process alone: beside it runs another one of pytest-xdist."""
+    with parallel_config("sequential"):
+        return studies.run(trial, seeds, **options)
 
 
 def central_differences(function, x, step=1e-6):
@@ -83,6 +91,11 @@ def changed(dataset, sensor, **fields):
 
 
 aruco, uwb = (partial(changed, sensor=sensor) for sensor in ("aruco", "uwb"))
+
+
+def only(dataset, rows):
+    """The Dataset with some of its sightings."""
+    return replace(dataset, aruco=dataset.aruco.select(rows))
 
 
 def vehicle(**fields):
@@ -174,15 +187,15 @@ def slam_trial(seed, ranges=True, markers=True, **options):
                "nees between": np.nanmean(np.delete(values, frame)),
                "last nees": values[-1], "wheel nees": wheel_nees(found, truth),
                "ate": ate(found.poses, truth.poses), "slip": found.slip,
-               "factor": found.noise.sightings, "arc": found.model == "arc"}
+               "factor": found.noise.sightings, "arc": found.model == "arc",
+               "share": found.share.mean(), "doubts": len(solution_doubts(found))}
     if markers:
         off = found.marker_in_world - true_markers(truth, found.marker)
         numbers |= {"map nees": map_nees(found, truth).mean(),
                     "map worst": np.abs(off)[:, :2].max()}
     if ranges:
         error, squared = antenna_error(found, truth)
-        numbers |= {"antenna nees": np.mean(squared), "antenna error": np.sqrt(np.mean(error**2)),
-                    "doubts": len(found.doubts)}
+        numbers |= {"antenna nees": np.mean(squared), "antenna error": np.sqrt(np.mean(error**2))}
     return numbers
 
 

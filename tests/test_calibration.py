@@ -43,7 +43,7 @@ from slamlib.robust.initialization import odometry_state
 from slamlib.robust.linear import NormalEquations, build_problem
 from slamlib.robust.measurements import Noise, measure
 from slamlib.robust.solution_doubts import solution_doubts
-from slamlib.studies.montecarlo import antenna_error
+from slamlib.studies.montecarlo import antenna_error, problems_3_and_4
 
 # Sensors of which every entry differs from its default.
 MOUNTED = Vehicle(camera_x=0.15, camera_y=-0.08, camera_turn=0.3, marker_size=1.03,
@@ -198,15 +198,9 @@ drive = cache(short)
 def right_ates(seed):
     """Aligned ATE in m of problems 3 and 4, of a drive whose files are right."""
     dataset, truth = drive(seed)
-    both = both_problems(dataset)
+    both = problems_3_and_4(dataset)
     assert not named(both[0]) and not named(both[1])
     return [aligned_ate(found, truth) for found in both]
-
-
-def both_problems(dataset):
-    """SlamResults of problems 3 and 4."""
-    markers = estimate(dataset.without("uwb"))
-    return markers, estimate(dataset, previous=markers)
 
 
 def named(found):
@@ -228,7 +222,7 @@ def test_a_wrong_statement_is_named_alone_and_mended_and_not_taken_for_slip(what
     spoilt = spoil(dataset, truth)
     before = [doubt.what for doubt in doubts_before_solving(spoilt)]
     assert before == ["odometry"] * (what == "wheelbase")
-    markers, both = both_problems(spoilt)
+    markers, both = problems_3_and_4(spoilt)
     assert named(both) == {what}
     assert named(markers) <= {what, "marker-size"} and bool(named(markers)) == markers_tell
     for found, right in zip((markers, both), right_ates(seed)):
@@ -251,7 +245,7 @@ def test_rows_that_are_lost_are_named_as_one_factor_on_both_wheels():
     """
     dataset, truth = drive(11)
     is_kept = np.random.default_rng(1).random((len(dataset.ticks), 1)) >= 0.02
-    for found in both_problems(counted(dataset, is_kept)):
+    for found in problems_3_and_4(counted(dataset, is_kept)):
         assert "wheel-scale" in named(found)
         assert aligned_ate(found, truth) < 0.03
         assert mean_nees(found, truth) < 15
@@ -271,7 +265,7 @@ def test_wheels_that_only_ranges_contradict_are_told_from_the_scale_of_ranges():
 def test_wheels_and_markers_may_be_wrong_at_once_where_ranges_give_the_metre():
     dataset, truth = drive(12)
     spoilt = seen_from(counted(dataset, 1.02), (0, 0, 0), size=1.03)
-    found = estimate(spoilt, previous=estimate(spoilt.without("uwb")))
+    found = problems_3_and_4(spoilt)[1]
     assert named(found) == {"wheel-scale", "marker-size"}
     assert_right(found, truth, 5 * right_ates(12)[1])
 
@@ -329,7 +323,7 @@ def test_the_model_of_a_step_that_a_wrong_size_made_does_not_blame_the_wheels():
 def test_four_wrong_statements_at_once_are_all_found():
     dataset, truth = drive(1)
     spoilt = ranged_from(seen_from(dataset, (0.08, 0, 0), size=1.02), truth, (0.2, 0), height=1.5)
-    found = estimate(spoilt, previous=estimate(spoilt.without("uwb")))
+    found = problems_3_and_4(spoilt)[1]
     assert found.released == {"camera-offset", "marker-size", "tag-offset", "antenna-height"}
     assert aligned_ate(found, truth) < 0.005
     assert mean_nees(found, truth) < 6
@@ -358,17 +352,6 @@ def test_problem_2_and_the_checks_of_files_see_by_the_stated_camera():
     assert doubts_before_solving(spoilt) and not doubts_before_solving(stated)
     for solve in (lambda d: localize(d.sightings), fuse, fuse_increments):
         assert_allclose(solve(stated).poses, solve(dataset).poses, atol=1e-9)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(5))
-def test_no_doubt_about_clean_drives(seed):
-    """Of all slips, with late ranges and wrong labels too; a long one is in test_uwb."""
-    slip = [0.0, 3e-4, 1e-3, 3e-3, 1e-2][seed]
-    dataset, _ = short(100 + seed, slip=slip, late_ranges=0.1 * (seed % 2),
-                       mislabelled=0.02 * (seed % 3 == 2))
-    markers, both = both_problems(dataset)
-    assert not named(markers) and not named(both)
 
 
 LOGS = Path(__file__).parents[2] / "shared" / "real_logs"             # where they are present

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from conftest import ROOT
-from numeric import aruco, assert_consistent, short, sigmas, uwb, vehicle
+from numeric import aruco, assert_consistent, only, short, sigmas, uwb, vehicle
 from numpy.testing import assert_allclose
 
 from slamlib import estimate, solve
@@ -254,7 +254,7 @@ def test_a_marker_with_a_single_accepted_sighting_is_unconfirmed():
     marker = np.bincount(seen.marker).argmax()
     again = np.flatnonzero(seen.marker == marker)[1:]
     others = np.setdiff1d(np.arange(len(seen.marker)), again)
-    found = estimate(replace(dataset, aruco=seen.select(others)))
+    found = estimate(only(dataset, others))
     assert found.unconfirmed.tolist() == [marker]
     assert not solution_doubts(found)
     row = solve.summarize(solve.problem_solution("problem3", dataset, found), None)

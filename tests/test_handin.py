@@ -9,6 +9,7 @@ from zipfile import ZipFile
 import numpy as np
 import pytest
 from conftest import ROOT
+from numeric import short
 from test_document import text_of
 from test_report import write
 
@@ -17,7 +18,7 @@ from slamlib.core.errors import DatasetError
 from slamlib.report import handin
 from slamlib.report.notebooks import Options
 from slamlib.solve import Solution, summarize
-from slamlib.studies.simulation import simulate, write_dataset
+from slamlib.studies.simulation import write_dataset
 
 SOLVE = """from slamlib.notebook import *
 from slamlib.solve import PROBLEMS, find
@@ -29,7 +30,7 @@ for drive in start():
 
 def drive_of(name="mine", first=40):
     """The first poses of a simulated drive, whose first sighting is at a later pose, no truth."""
-    dataset = simulate("short", seed=3)[0].first(first)
+    dataset, _ = short(3, first)
     later = dataset.aruco.select(dataset.aruco.pose >= 10)
     return replace(dataset, name=name, aruco=later)
 
@@ -38,10 +39,8 @@ def drive_of(name="mine", first=40):
 def handed(tmp_path_factory):
     """A hand-in of a recorded dataset beside a simulated one, and what the run said."""
     folder = tmp_path_factory.mktemp("hand in")
-    simulated, truth = simulate("short", seed=4)
     write_dataset(folder / "data" / "mine", drive_of())
-    write_dataset(folder / "data" / "stand_in", simulated.first(30),
-                  replace(truth, poses=truth.poses[:30]))
+    write_dataset(folder / "data" / "stand_in", *short(4, 30))
     write(folder / "notebooks", "B_more", "# B. More\n\nOnly if asked for.")
     write(folder / "notebooks", "1_all", "# 1. All", (SOLVE,), "## 1.1 Middle\n\nRead this.")
     (folder / "report.toml").write_text('author = "Ada"\n')

@@ -11,6 +11,7 @@ from numeric import (
     as_points,
     carried,
     counts,
+    only,
     seen_from,
     short,
     sightings,
@@ -76,7 +77,7 @@ def test_a_jump_is_where_most_contradicting_pairs_span_it():
     poses[20:] = [0.4, 0.3, 0.5]
     dataset = seen(poses, np.tile(MARKERS, (2, 1)))
     in_room = dataset.aruco.pose // 10 % 2 == dataset.aruco.marker // 3
-    found = jumps.find_jumps(replace(dataset, aruco=dataset.aruco.select(in_room)))
+    found = jumps.find_jumps(only(dataset, in_room))
     assert_allclose(found.mended(np.arange(40), np.zeros((40, 3))), poses, atol=1e-6)
 
 
@@ -92,6 +93,13 @@ def test_shares_of_a_jump_by_hand():
     assert_allclose(covariance[1], np.diag([0.04, 0.04, 0.01]))
     spike = replace(found, chance=np.cumsum([1, 1, 1, 1, 1e6, 1, 1, 1, 1]))
     assert_allclose(spike.share(start, end)[:, 0], [0, 0, 1, 1, 0], atol=1e-5)
+
+
+def test_a_spike_is_likely_to_be_the_jump_also_in_reverse():
+    ticks = np.full((400, 2), -127)
+    ticks[7, 0] = -4000
+    chance = np.diff(jumps._chance(ticks, np.arange(400) == 9))
+    assert np.flatnonzero(chance > 1).tolist() == [6, 8]               # into poses 7 and 9
 
 
 def errors(result, truth):
@@ -139,7 +147,7 @@ def test_a_push_that_no_marker_saw_is_found_at_the_solution():
     truth = replace(truth, poses=np.delete(truth.poses, slice(1103, 1109), axis=0))
     dataset = carried(dataset, 1103, 1109).without("uwb")
     unseen = np.abs(dataset.aruco.pose - 1140) <= 100
-    found = estimate(replace(dataset, aruco=dataset.aruco.select(~unseen)))
+    found = estimate(only(dataset, ~unseen))
     assert [doubt.what for doubt in solution_doubts(found)] == ["encoder"]
     assert found.jumps.start < 1103 < found.jumps.end and found.slip < 5e-4
     assert errors(found, truth)[1] < 6
@@ -215,8 +223,10 @@ def test_turns_on_the_spot_under_a_camera_that_looks_ahead_are_no_breaks():
 
 
 def test_the_doubt_names_three_stretches_and_counts_the_others():
+    """The second one is two jumps, four poses apart."""
     poses = np.zeros((300, 3))
     poses[:, 0] = 0.3 * (np.arange(300) // 50 % 2)
+    poses[100:104, 0] = 0.9
     result = SimpleNamespace(jumps=jumps.find_jumps(seen(poses)))
     sentence, = (doubt.sentence for doubt in _encoder_doubts(result))
     assert "between poses 50 and 51 the vehicle moved by 0.00 m and 0 degrees, but the markers " \
