@@ -137,6 +137,7 @@ def report_on_all(tmp_path_factory, kept):
     All but `short` are cut to 300 or 900 poses: no assertion on the pages needs more.
     """
     import numpy as np
+    from numeric import only
 
     from slamlib.studies.simulation import manoeuvre, simulate, write_dataset
     folder = tmp_path_factory.mktemp("built")
@@ -151,8 +152,8 @@ def report_on_all(tmp_path_factory, kept):
             ("waits", replace(bare, ticks=np.r_[np.zeros((100, 2)), bare.ticks[:200]]), None),
             ("one_pose", bare.first(1), None),
             ("backs_up", replace(bare, ticks=np.rint(manoeuvre([(2, 1.0), (-2, 0.5)]))), None),
-            ("one_sighting", replace(new, aruco=new.aruco.select([0])), truth),
-            ("sparse", replace(new, aruco=new.aruco.select(sparse)), truth)):
+            ("one_sighting", only(new, [0]), truth),
+            ("sparse", only(new, sparse), truth)):
         write_dataset(data / name, dataset, true)
     copied(folder / "notebooks", "*.ipynb")
     built_elsewhere(folder / "notebooks", data, folder / "report", folder / "results",

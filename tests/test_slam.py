@@ -88,9 +88,10 @@ def learned_noise(seed, slip):
 def test_a_slip_that_is_not_known_widens_the_covariance(slip):
     """No overconfidence, and nearly the accuracy of the graph that knows the slip.
 
-    A usual slip is in `test_monte_carlo_is_consistent`. Nothing is doubted. The mean NEES is at most 1.35 times that
+    A usual slip is in `test_monte_carlo_is_consistent`. The mean NEES is at most 1.35 times that
     with the slip known or 3.6, whichever is larger, and no drive is above 16. With correct labels
-    few sightings are rejected, and a large slip is learned from the typical one.
+    few sightings are rejected, nothing is doubted, and a large slip is learned from the typical
+    one.
     """
     runs = trials(learned_noise, range(3000, 3008), slip=slip)
     most = max(1.35 * runs["known nees"].mean(), 3.6)
