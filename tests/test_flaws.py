@@ -17,7 +17,12 @@ from slamlib.io.dataset import read_dataset, read_truth
 from slamlib.robust.calibration import CAMERA, SIGHTING_LAG
 from slamlib.robust.file_doubts import doubts_before_solving
 from slamlib.robust.measurements import Noise
-from slamlib.robust.solution_doubts import GROUPS, _rejection_doubts, solution_doubts
+from slamlib.robust.solution_doubts import (
+    GROUPS,
+    _rejection_doubts,
+    contradiction_doubts,
+    solution_doubts,
+)
 from slamlib.studies.simulation import manoeuvre
 
 
@@ -215,6 +220,14 @@ def test_many_rejected_sightings_are_named_of_all_and_of_single_markers(wrong, r
     sentences = [doubt.sentence for doubt in doubts]
     assert len(sentences) == (said is not None)
     assert all(said in sentence for sentence in sentences)
+
+
+def test_a_fusion_that_contradicts_problem_3_is_told_with_distance_and_share():
+    """Half of the poses are 5 cm and five standard deviations away."""
+    poses = np.zeros((10, 3))
+    poses[5:, :2] = [0.03, 0.04]
+    doubt, = contradiction_doubts(poses, np.tile(1e-4 * np.eye(3), (10, 1, 1)), 0 * poses)
+    assert "up to 0.05 m from problem 3, and at 50% of the poses" in doubt.sentence
 
 
 def test_a_turn_that_the_wheels_hardly_know_is_named_where_it_is(found):
