@@ -73,10 +73,6 @@ def look():
         plt.close("all")
 
 
-BROUGHT = ("new seed", "no_truth", "wheels_only", "waits", "one_pose", "backs_up", "one_sighting",
-           "sparse")
-
-
 def copied(target, chapters, first=None):
     """Write notebooks to a folder, by a pattern of their names.
 

@@ -138,13 +138,13 @@ def standing(dataset, truth, rows, count, at=0, every=1):
     """
     seen = replace(dataset.aruco, pose=dataset.aruco.pose + rows * (dataset.aruco.pose > at))
     frames = at + np.arange(every, rows + 1, every)
-    here = seen.select(seen.pose == at)
-    again = here.select(np.tile(np.arange(len(here.pose)), len(frames)))
-    z = se2.between(truth.poses[at], true_markers(truth, again.marker))
-    z += errors_of(again.covariance, np.random.default_rng(0))
-    again = replace(again, pose=np.repeat(frames, len(here.pose)), marker_in_vehicle=z)
-    joined = ArucoReadings(*(np.concatenate(each) for each in zip(
-        vars(seen).values(), vars(again).values())))
+    here = np.flatnonzero(seen.pose == at)
+    joined = seen.select(np.append(np.arange(len(seen.pose)), np.tile(here, len(frames))))
+    again = slice(len(seen.pose), None)
+    joined.pose[again] = np.repeat(frames, len(here))
+    z = se2.between(truth.poses[at], true_markers(truth, joined.marker[again]))
+    z += errors_of(joined.covariance[again], np.random.default_rng(0))
+    joined.marker_in_vehicle[again] = z
     ticks = np.insert(dataset.ticks, at + 1, np.full((rows, 2), count), axis=0)
     poses = np.insert(truth.poses, at + 1, np.tile(truth.poses[at], (rows, 1)), axis=0)
     order = np.argsort(joined.pose, kind="stable")

@@ -220,20 +220,6 @@ def counted(dataset, factor):
 
 
 @pytest.mark.slow
-def test_rows_that_are_lost_are_named_as_one_factor_on_both_wheels():
-    """By turns, which markers of another size do not explain; by ranges where there are some.
-
-    They are so many small jumps, too; taken for larger markers they cost 0.09 m, with NEES of 200.
-    """
-    dataset, truth = drive(11)
-    is_kept = np.random.default_rng(1).random((len(dataset.ticks), 1)) >= 0.02
-    for found in problems_3_and_4(counted(dataset, is_kept)):
-        assert "wheel-scale" in named(found)
-        assert aligned_ate(found, truth) < 0.03
-        assert mean_nees(found, truth) < 15
-
-
-@pytest.mark.slow
 def test_wheels_that_only_ranges_contradict_are_told_from_the_scale_of_ranges():
     """The offset and scale of the ranges are two entries that nobody stated; turns tell them."""
     dataset, truth = drive(11)

@@ -1,6 +1,5 @@
 """Drives that are not as their files say: the estimate holds, or a doubt names what is wrong."""
 
-import itertools
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -26,10 +25,10 @@ from slamlib.robust.solution_doubts import (
 from slamlib.studies.simulation import manoeuvre
 
 
-def sightings_of(variances, correlation=0.0, i=0, j=1):
-    """A change of all sightings: other variances of x, y and heading; i and j are correlated."""
+def sightings_of(variances, covariance=0.0):
+    """A change of all sightings: variances of x, y and heading, and covariance of the last two."""
     C = np.diag(variances)
-    C[i, j] = C[j, i] = correlation * np.sqrt(C[i, i] * C[j, j])
+    C[1, 2] = C[2, 1] = covariance
     return lambda d: aruco(d, covariance=np.broadcast_to(C, d.aruco.covariance.shape))
 
 
@@ -50,7 +49,6 @@ def range_sigmas(sigma, rows=slice(None)):
     return change
 
 
-NEARLY_1 = 1 - 1e-11
 LEGAL = {                                      # within the limits, and far from what is usual
     "an unknown heading of pose 1": vehicle(sigma_heading=10.0),
     "very certain wheels": vehicle(
@@ -62,16 +60,15 @@ LEGAL = {                                      # within the limits, and far from
     "the most uncertain sightings": sightings_of([1e8, 1e8, 1e14]),
     "a sighting of a direction": one_sighting(1e-18, 1e8, 1e-18),
     "sightings of a distance": sightings_of([1e8, 1e-18, 1e14]),
-    "correlations of almost 1": sightings_of([1e-4, 1e-4, 1e-4], NEARLY_1),
-    "correlations with heading of almost 1": sightings_of([1e-4, 1e-4, 1e-4], NEARLY_1, 1, 2)}
+    "correlations of almost 1": sightings_of([1e-4, 1e-4, 1e-4], 1e-4 - 1e-15)}
 
 
 @pytest.mark.slow
 def test_offsets_of_the_camera_have_the_standard_deviations_that_they_state():
     """Eight clean drives of two slips, with a camera and a delay that are hardly known."""
     time, place = [], []
-    for seed, slip in itertools.product(range(4), (1e-3, 3e-3)):
-        dataset, _ = short(seed, slip=slip)
+    for seed in range(8):
+        dataset, _ = short(seed, slip=1e-3 + 2e-3 * (seed % 2))
         found = estimate(vehicle(
             sigma_sighting_lag=10.0, sigma_camera_x=0.2, sigma_camera_y=0.2,
             sigma_camera_turn=0.2)(dataset.without("uwb")))

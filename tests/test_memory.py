@@ -50,14 +50,9 @@ def test_shares_by_hand():
     assert_allclose(share[:, 2:-1], 1 / (1 + 2 * rho[0]))
 
 
-@pytest.fixture(scope="module")
-def remembering():
+def test_memory_is_told_and_counted():
     dataset = short(3, memory=0.9)[0].without("uwb")
-    return dataset, estimate(dataset)
-
-
-def test_memory_is_told_and_counted(remembering):
-    dataset, result = remembering
+    result = estimate(dataset)
     assert result.correlation[0] > 0.4 and result.correlation[1] == 0
     assert result.share.sum() < len(dataset.aruco.pose) / 3
     assert 1 <= result.noise.sightings < 1.2

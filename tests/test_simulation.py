@@ -2,13 +2,12 @@ import numpy as np
 import pytest
 from conftest import ROOT
 from kills import contents
-from numeric import short, true_markers
+from numeric import short
 from numpy.testing import assert_allclose, assert_array_equal
 
-from slamlib.core import odometry, se2
 from slamlib.core.vehicle import Vehicle
 from slamlib.io.dataset import read_dataset, read_truth
-from slamlib.studies.simulation import confuse_labels, distances, simulate, write_dataset
+from slamlib.studies.simulation import confuse_labels, simulate, write_dataset
 
 DATA = ROOT / "data"
 RECIPES = {"short": dict(path="short", seed=1),
@@ -24,29 +23,6 @@ def test_committed_stand_ins_are_regenerated_to_the_byte(name, tmp_path):
     committed = contents(DATA / name)
     assert made.keys() == committed.keys()
     assert [file for file in made if made[file] != committed[file]] == []
-
-
-def sighting_errors(dataset, truth):
-    """Errors (m, 3) of the sightings."""
-    aruco = dataset.aruco
-    exact = se2.between(truth.poses[aruco.pose], true_markers(truth, aruco.marker))
-    return se2.difference(aruco.marker_in_vehicle, exact)
-
-
-def range_errors(dataset, truth):
-    """Errors (r,) of the ranges."""
-    uwb = dataset.uwb
-    antenna = truth.antenna_in_world[np.searchsorted(truth.antenna, uwb.antenna)]
-    return uwb.range - distances(truth.poses[uwb.pose], antenna)
-
-
-def test_perfect_data_agrees_with_its_truth():
-    dataset, truth = short(4, noise=False)
-    poses = odometry.dead_reckoning(dataset.ticks, dataset.vehicle, model="arc")
-    for error in (poses - truth.poses, sighting_errors(dataset, truth),
-                  range_errors(dataset, truth),
-                  dataset.antenna_guess.position - truth.antenna_in_world):
-        assert_allclose(error, 0, atol=1e-10)
 
 
 def test_files_round_trip_through_the_reader(tmp_path):

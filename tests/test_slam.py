@@ -196,7 +196,6 @@ def test_markers_of_unknown_heading_are_mapped_as_points():
     assert_allclose(found.marker_covariance[:, 2, 2], 1e4)
     off = found.marker_in_world - true_markers(truth, found.marker)
     assert np.abs(off)[:, :2].max() < 0.05
-    assert (found.marker_covariance[:, [0, 1], [0, 1]] < 0.05**2).all()
 
 
 def test_the_gate_rejects_wrong_labels_and_hardly_any_others():
