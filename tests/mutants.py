@@ -90,7 +90,7 @@ def mutants(texts, seed):
 
 def main():
     """Print every survivor, and the share of the others."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = argparse.ArgumentParser()
     parser.add_argument("--count", type=int, default=100, help="number of mutants (default 100)")
     parser.add_argument("--seed", type=int, default=0, help="of the draw (default 0)")
     parser.add_argument("--only", default="", help="modules whose name begins so: core, robust/fit")

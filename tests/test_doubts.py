@@ -148,10 +148,10 @@ def test_wheels_that_are_wrong_for_most_of_the_drive_are_doubted_and_left():
 
 # Drives with nothing to doubt: functions of a simulated drive, its truth and a random generator.
 
-def wheels_off(factor, base=1.0):
-    """Wheels and wheelbase that are not as stated."""
-    wrong = Vehicle(right_radius=0.1 * factor, wheelbase=0.4 * base)
-    return lambda d, truth, rng: replace(drive(1, vehicle=wrong)[0], vehicle=Vehicle())
+def driven_by(**fields):
+    """Wheels or a wheelbase that are not as stated."""
+    true = Vehicle(**fields)
+    return lambda d, truth, rng: replace(drive(1, vehicle=true)[0], vehicle=Vehicle())
 
 
 def headings_unknown(rows):
@@ -170,8 +170,8 @@ def overconfident(factor, sigma):
 RIGHT = {
     "standing": lambda d, truth, rng: standing(d.first(1), truth, 1999, count=0, every=10)[0],
     "waiting": lambda d, truth, rng: standing(d.first(1001), truth, 1000, 0, every=9999)[0],
-    "a wheel": wheels_off(1.01),
-    "the base": wheels_off(1.0, 1.01), "no headings": headings_unknown(slice(None)),
+    "a wheel": driven_by(right_radius=0.101),
+    "the base": driven_by(wheelbase=0.404), "no headings": headings_unknown(slice(None)),
     "every second heading": headings_unknown(slice(0, None, 2)),
     "far too small": overconfident(1e-4, 0.03), "too small": overconfident(1e-2, 0.03)}
 

@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from joblib import parallel_config
-from numeric import aruco, short
+from numeric import aruco, known_noise, short
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.io import loadmat, savemat
 
@@ -184,8 +184,7 @@ def test_the_vehicle_as_estimated_can_be_taken_over(tmp_path):
 
 
 def test_where_all_is_stated_no_vehicle_is_written(tmp_path, drive):
-    known = replace(drive[0].vehicle, slip=1e-3, marker_noise_factor=1.0, range_noise_factor=1.0)
-    solve.solve_to_folder(replace(drive[0], vehicle=known), None, tmp_path, ["problem4"])
+    solve.solve_to_folder(known_noise(drive[0], 1e-3), None, tmp_path, ["problem4"])
     assert not (tmp_path / "vehicle.toml").exists()
 
 

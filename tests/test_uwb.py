@@ -47,17 +47,17 @@ EXACT = Vehicle(sigma_right_radius=1e-9, sigma_left_radius=1e-9, sigma_wheelbase
                 sigma_heading=1e-9, ticks_per_revolution=1e9)
 
 
-def drive(legs, place, guess, every=10, sigma=0.05, antenna=7):
-    """A Dataset with exact odometry and exact ranges to one antenna, and its path (n, 3).
+def drive(legs, place, guess):
+    """A Dataset with exact odometry and exact ranges to antenna 7, and its path (n, 3).
 
-    `legs` of `manoeuvre`; true and guessed `place` in m; a range of this sigma `every` few rows.
+    `legs` of `manoeuvre`; true and guessed `place` in m; a range of sigma 5 cm every ten rows.
     """
     ticks = np.rint(manoeuvre(legs, EXACT)).astype(int)
     poses = dead_reckoning(ticks, EXACT, model="arc")
-    at = np.arange(0, len(poses), every)
+    at = np.arange(0, len(poses), 10)
     r = np.hypot(*(poses[at, :2] - place).T)
-    ranges = UwbReadings(at, np.full(len(at), antenna), r, np.full(len(at), sigma))
-    guesses = AntennaGuess(np.array([antenna]), np.array([guess]))
+    ranges = UwbReadings(at, np.full(len(at), 7), r, np.full(len(at), 0.05))
+    guesses = AntennaGuess(np.array([7]), np.array([guess]))
     return Dataset("drive", EXACT, ticks, None, ranges, guesses), poses
 
 
@@ -233,10 +233,10 @@ def test_ranges_in_the_plane_by_hand():
     assert_array_equal(found.guess, [2.5, 4.0])
 
 
-def exact_ranges(path, sigma=0.05, guess=(3.2, 4.2)):
+def exact_ranges(path, sigma):
     """AntennaRanges from a path (n, 2) to (3, 4)."""
     return AntennaRanges(path, np.hypot(*(path - [3.0, 4.0]).T), np.full(len(path), sigma),
-                         np.array(guess))
+                         np.array([3.2, 4.2]))
 
 
 def test_second_moment_is_that_of_a_mixture_of_both_mirror_images():
