@@ -20,9 +20,10 @@ settings.register_profile("long", deadline=None, database=None, max_examples=100
 settings.load_profile("short")           # another one by `pytest --hypothesis-profile=NAME`
 
 ROOT = Path(__file__).parents[1]
-# The longest come first, and those that mostly wait beside those that start further processes.
-FIRST = ("test_pages", "test_concurrency", "test_slam", "test_flaws", "test_memory", "test_uwb",
-         "test_localization", "test_jumps", "test_calibration", "test_numbers", "test_studies")
+# By the seconds of processors that they take: several processes take one file after the other.
+FIRST = ("test_studies", "test_pages", "test_slam", "test_calibration", "test_localization",
+         "test_uwb", "test_jumps", "test_memory", "test_results", "test_properties",
+         "test_concurrency", "test_flaws", "test_numbers")
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 

@@ -123,9 +123,9 @@ def carried(d, begin, end):
 
 
 def seen_from(dataset, camera=(0.0, 0.0, 0.0), size=1.0):
-    """The dataset of a camera elsewhere, of larger markers."""
-    z = se2.between(np.array(camera), dataset.aruco.marker_in_vehicle)
-    covariance = se2.rotate_covariance(dataset.aruco.covariance, -camera[2])
+    """The dataset of a camera elsewhere, (3,) or one of each sighting, of larger markers."""
+    z = se2.between(camera, dataset.aruco.marker_in_vehicle)
+    covariance = se2.rotate_covariance(dataset.aruco.covariance, -np.array(camera)[..., 2])
     scale = np.array([size, size, 1])
     return aruco(dataset, marker_in_vehicle=z / scale,
                  covariance=covariance / np.outer(scale, scale))

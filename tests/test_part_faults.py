@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numeric import aligned_ate, aruco, counts, mean_nees, short, without_headings
+from numeric import aligned_ate, counts, mean_nees, seen_from, short, without_headings
 from numpy.testing import assert_allclose, assert_array_equal
 
 from slamlib import estimate, fuse
@@ -22,14 +22,9 @@ def with_moved_camera(dataset, pose, stated=None):
     """The sightings of a camera that is as stated until a pose, then elsewhere by BUMP."""
     stated = stated or Vehicle()
     camera = np.array([stated.camera_x, stated.camera_y, stated.camera_turn])
-    scale = np.array([stated.marker_size, stated.marker_size, 1.0])
     later = dataset.aruco.pose >= pose
-    moved = se2.compose(BUMP, camera)
-    place = np.where(later[:, None], moved, camera)
-    z = se2.between(place, dataset.aruco.marker_in_vehicle) / scale
-    C = se2.rotate_covariance(dataset.aruco.covariance, -place[:, 2])
-    C = C / scale / scale[:, None]
-    return replace(aruco(dataset, marker_in_vehicle=z, covariance=C), vehicle=stated)
+    place = np.where(later[:, None], se2.compose(BUMP, camera), camera)
+    return replace(seen_from(dataset, place, stated.marker_size), vehicle=stated)
 
 
 @pytest.mark.parametrize("stated", [Vehicle(), MOUNTED], ids=["in the origin", "mounted"])
