@@ -23,7 +23,7 @@ ROOT = Path(__file__).parents[1]
 # By the seconds of processors that they take: several processes take one file after the other.
 FIRST = ("test_studies", "test_pages", "test_slam", "test_calibration", "test_localization",
          "test_uwb", "test_jumps", "test_memory", "test_results", "test_properties",
-         "test_concurrency", "test_flaws", "test_numbers")
+         "test_concurrency")
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 

@@ -250,7 +250,6 @@ def test_markers_of_one_accepted_sighting_or_at_the_place_of_another_are_unconfi
     """The latter as of wrong labels, if they are seen less often. The summary names them."""
     marker, count = np.unique(found.sightings.marker, return_counts=True)
     once, less, more = np.argsort(count, kind="stable")[[1, 0, -1]]
-    assert 1 < count[less] < count[more]
     of_once = np.flatnonzero(found.sightings.marker == marker[once])
     place = found.marker_in_world.copy()
     place[less, :2] = place[more, :2] + 0.01

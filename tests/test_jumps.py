@@ -23,7 +23,7 @@ from numpy.testing import assert_allclose
 
 from slamlib import estimate
 from slamlib.core import se2
-from slamlib.core.evaluation import anees, ate
+from slamlib.core.evaluation import ate
 from slamlib.core.odometry import dead_reckoning
 from slamlib.core.records import Dataset
 from slamlib.robust import jumps
@@ -215,7 +215,7 @@ def test_sightings_that_are_late_are_no_jumps_and_start_at_their_delay(stated):
 @pytest.mark.parametrize("change", [
     lambda a: a, lambda a: replace(a, covariance=a.covariance / 16),
     lambda a: replace(a, pose=a.pose + 8).select(a.pose < a.pose.max() - 8),
-    lambda a: as_points(a, slice(None))], ids=["as they are", "overconfident", "late", "points"])
+    lambda a: as_points(a, slice(None))])
 @pytest.mark.parametrize("options", [
     {}, {"slip": 0.0}, {"slip": 1e-2}, {"mislabelled": 0.03}], ids=str)
 def test_no_jump_in_clean_drives(change, options):
@@ -251,8 +251,8 @@ def test_counts_that_creep_while_the_vehicle_stands_say_nothing(count):
     """10 of 127 usual counts a row: half a metre in 600 rows. Believed, they cost 0.15 m."""
     dataset, poses = standing(*short(1), rows=600, count=count, at=600, every=10)
     found = estimate(dataset)
-    assert ate(found.poses, poses, aligned=True) < 4e-3
-    assert anees(found.poses, found.covariances, poses) < 5
+    truth = SimpleNamespace(poses=poses)
+    assert aligned_ate(found, truth) < 4e-3 and mean_nees(found, truth) < 5
     assert not solution_doubts(found)
 
 

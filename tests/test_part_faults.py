@@ -27,7 +27,7 @@ def with_moved_camera(dataset, pose, stated=None):
     return replace(seen_from(dataset, place, stated.marker_size), vehicle=stated)
 
 
-@pytest.mark.parametrize("stated", [Vehicle(), MOUNTED], ids=["in the origin", "mounted"])
+@pytest.mark.parametrize("stated", [Vehicle(), MOUNTED])
 @pytest.mark.parametrize("pose", [600, 1500])
 def test_a_camera_that_was_moved_is_found_and_its_sightings_are_mended(pose, stated):
     clean, _ = short(2)

@@ -37,7 +37,7 @@ from slamlib.robust.initialization import (
     trilaterate,
 )
 from slamlib.robust.linear import consistency_factor
-from slamlib.robust.measurements import measure
+from slamlib.robust.measurements import Accepted, measure
 from slamlib.solve import problem_solution
 from slamlib.studies import comparisons
 from slamlib.studies.simulation import manoeuvre
@@ -302,6 +302,13 @@ def test_a_kernel_takes_a_known_part_of_the_variance(kernel):
     """The mean of r^2 by the weights; without a kernel it is 1."""
     assert consistency_factor(None) == 1 > 0.98 > consistency_factor(kernel)
     assert np.isclose(consistency_factor(kernel), weighted_mean(R**2, kernel, R), rtol=1e-4)
+
+
+def test_a_range_loses_weight_from_the_bias_of_the_kernel_on():
+    """Two sigmas beyond it Tukey's kernel leaves (1 - (2 / 4.685)^2)^2."""
+    b = ONE_SIDED["asymmetric Tukey"]
+    accepted = Accepted(np.ones(2), np.ones(2), KERNELS["asymmetric Tukey"], b)
+    assert_allclose(accepted.kept(np.array([b - 3, b + 2])), [1, (1 - (2 / 4.685)**2)**2])
 
 
 @pytest.mark.parametrize("name", ONE_SIDED)
