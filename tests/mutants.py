@@ -92,7 +92,7 @@ def main():
     """Print every survivor, and the share of the others."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--count", type=int, default=100, help="number of mutants (default 100)")
-    parser.add_argument("--seed", type=int, default=0, help="of the draw (default 0)")
+    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", default="", help="modules whose name begins so: core, robust/fit")
     given = parser.parse_args()
     resource.setrlimit(resource.RLIMIT_AS, (8 << 30, 8 << 30))             # bytes

@@ -257,7 +257,7 @@ def test_few_different_counts_are_no_counts_that_were_cut_off():
 
 
 @pytest.mark.parametrize("spoil, is_recognised", [
-    (lambda C: np.sqrt(C), True), (lambda C: C / 100, False)], ids=["sigmas", "too small"])
+    (lambda C: np.sqrt(C), True), (lambda C: C / 100, False)])
 def test_standard_deviations_in_the_columns_of_variances_are_recognised(spoil, is_recognised):
     dataset = drive(11)[0].without("uwb")
     variance = np.diagonal(dataset.aruco.covariance, axis1=1, axis2=2)

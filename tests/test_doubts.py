@@ -91,7 +91,7 @@ FLAWS = {                                           # how, kinds of doubts, and 
 }
 
 
-@pytest.mark.parametrize("options", [{"slip": 0.0}, {"mislabelled": 0.03}], ids=str)
+@pytest.mark.parametrize("options", [{"slip": 0.0}, {"mislabelled": 0.03}])
 @pytest.mark.parametrize("flaw", FLAWS)
 def test_a_flaw_is_named(flaw, options):
     """With right covariances, and with sigmas of sightings that are half or twice as large.
@@ -193,7 +193,7 @@ def test_a_wheel_without_any_counts_is_the_only_cause(alive, name):
 
 
 @pytest.mark.parametrize("options", [
-    {}, {"slip": 0.0}, {"slip": 1e-2}, {"mislabelled": 0.01, "late_ranges": 0.15}], ids=str)
+    {}, {"slip": 0.0}, {"slip": 1e-2}, {"mislabelled": 0.01, "late_ranges": 0.15}])
 @pytest.mark.parametrize("path, seed", [
     ("short", 0), ("short", 1), pytest.param("long", 0, marks=pytest.mark.slow)])
 def test_a_clean_drive_gives_no_doubt(path, seed, options):

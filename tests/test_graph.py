@@ -108,7 +108,7 @@ GROUPS = [(), ("camera-offset", WHEEL_SCALE), ("marker-size", "time-offset"),
           tuple({entry.group for entry in ENTRIES} | {"antenna-offsets"})]
 
 
-@pytest.mark.parametrize("groups", GROUPS, ids=len)
+@pytest.mark.parametrize("groups", GROUPS)
 @pytest.mark.parametrize("kernel", ["asymmetric Tukey", "Cauchy"])
 def test_the_graph_is_the_one_by_which_the_engine_decides(groups, kernel):
     """Error, information and gradient, for kernels, shares, noise, jumps and any calibration."""
@@ -327,7 +327,7 @@ def test_the_average_over_the_slip_is_that_of_the_engine():
     ({"tag_x": 0.1, "sigma_range_scale": 0.01}, (True, True, False)),
     ({"antenna_height": 1.0}, (True, True, False)),
     ({"antenna_height": 1.0, "sigma_antenna_height": 0.2, "range_offset": 0.05},
-     (True, True, False))], ids=str)
+     (True, True, False))])
 def test_with_a_calibration_that_is_stated_or_unknown_both_agree(drive, change, is_native):
     """Three markers are points. What needs no calibration has GTSAM's own factors."""
     points = np.isin(drive[0].aruco.marker, drive[0].aruco.marker[:3])

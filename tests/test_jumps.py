@@ -217,7 +217,7 @@ def test_sightings_that_are_late_are_no_jumps_and_start_at_their_delay(stated):
     lambda a: replace(a, pose=a.pose + 8).select(a.pose < a.pose.max() - 8),
     lambda a: as_points(a, slice(None))])
 @pytest.mark.parametrize("options", [
-    {}, {"slip": 0.0}, {"slip": 1e-2}, {"mislabelled": 0.03}], ids=str)
+    {}, {"slip": 0.0}, {"slip": 1e-2}, {"mislabelled": 0.03}])
 def test_no_jump_in_clean_drives(change, options):
     for path, seed in (("short", 0), ("short", 1), ("short", 2), ("long", 0)):
         dataset, _ = simulate(path, seed=seed, **options)

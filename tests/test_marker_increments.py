@@ -172,8 +172,8 @@ def test_returns_measure_the_true_motion(wrong):
 
 def test_in_reverse_there_are_as_many_returns():
     dataset, _ = short(3)
-    found = returns(replace(dataset, ticks=-dataset.ticks))
-    assert_array_equal(found.end, returns(dataset).end)
+    reverse = replace(dataset, ticks=-dataset.ticks)
+    assert_array_equal(returns(reverse).end, returns(dataset).end)
 
 
 def test_a_drive_without_markers_or_that_goes_nowhere_again_has_no_returns():
@@ -182,3 +182,14 @@ def test_a_drive_without_markers_or_that_goes_nowhere_again_has_no_returns():
         found = returns(each)
         assert found.discrepancies(truth.poses).shape == (0, 3)
         assert found.covariance.shape == (0, 3, 3)
+
+
+def test_the_covariance_of_returns_is_consistent():
+    """The last return of each of eight drives, so that they are independent."""
+    values = []
+    for seed in range(8):
+        dataset, truth = short(seed, slip=3e-3)
+        found = returns(dataset)
+        off = found.discrepancies(truth.poses)
+        values.append(nees(off, found.covariance, 0 * off)[-1])
+    assert_consistent(values)

@@ -213,7 +213,7 @@ def test_a_second_place_gets_a_readable_id_that_the_drive_does_not_have():
     assert_array_equal(found, [-7, 93, -107, 0, 100, 12, 212])
 
 
-@pytest.mark.parametrize("legs", [[(60, 0)], [(30, 0), (0.8, np.pi / 2), (30, 0)]], ids=str)
+@pytest.mark.parametrize("legs", [[(60, 0)], [(30, 0), (0.8, np.pi / 2), (30, 0)]])
 def test_nothing_is_released_in_a_clean_corridor(legs, monkeypatch):
     """Without a loop only what is stated gives the metre: released wheels would run away."""
     right, left = COUNT * simulation.manoeuvre(legs)[1:].T
