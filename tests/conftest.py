@@ -20,9 +20,10 @@ settings.register_profile("long", deadline=None, database=None, max_examples=100
 settings.load_profile("short")           # another one by `pytest --hypothesis-profile=NAME`
 
 ROOT = Path(__file__).parents[1]
-# The longest come first, and those that mostly wait beside those that start further processes.
-FIRST = ("test_pages", "test_concurrency", "test_slam", "test_flaws", "test_memory", "test_uwb",
-         "test_localization", "test_jumps", "test_calibration", "test_numbers", "test_studies")
+# By the seconds of processors that they take: several processes take one file after the other.
+FIRST = ("test_studies", "test_pages", "test_slam", "test_calibration", "test_localization",
+         "test_uwb", "test_jumps", "test_memory", "test_results",
+         "test_properties")
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 
@@ -71,10 +72,6 @@ def look():
         plt.style.use(plotting.STYLE)
         yield
         plt.close("all")
-
-
-BROUGHT = ("new seed", "no_truth", "wheels_only", "waits", "one_pose", "backs_up", "one_sighting",
-           "sparse")
 
 
 def copied(target, chapters, first=None):
@@ -137,16 +134,13 @@ def report_on_all(tmp_path_factory, kept):
     All but `short` are cut to 300 or 900 poses: no assertion on the pages needs more.
     """
     import numpy as np
+    from numeric import only
 
-    from slamlib.io.dataset import read_dataset, read_truth
     from slamlib.studies.simulation import manoeuvre, simulate, write_dataset
     folder = tmp_path_factory.mktemp("built")
     data = folder / "data"
-    long = ROOT / "data" / "long"
     shutil.copytree(ROOT / "data", data, ignore=lambda *_: ["long"])
-    truth = read_truth(long)
-    write_dataset(data / "long", read_dataset(long).first(900),
-                  replace(truth, poses=truth.poses[:900]))
+    write_dataset(data / "long", *simulate("long", 2, poses=900, late_ranges=0.05))
     new, truth = simulate("short", 77, poses=300, late_ranges=0.15)
     bare = new.without("aruco").without("uwb")
     sparse = new.aruco.pose % 150 == 0
@@ -155,8 +149,8 @@ def report_on_all(tmp_path_factory, kept):
             ("waits", replace(bare, ticks=np.r_[np.zeros((100, 2)), bare.ticks[:200]]), None),
             ("one_pose", bare.first(1), None),
             ("backs_up", replace(bare, ticks=np.rint(manoeuvre([(2, 1.0), (-2, 0.5)]))), None),
-            ("one_sighting", replace(new, aruco=new.aruco.select([0])), truth),
-            ("sparse", replace(new, aruco=new.aruco.select(sparse)), truth)):
+            ("one_sighting", only(new, [0]), truth),
+            ("sparse", only(new, sparse), truth)):
         write_dataset(data / name, dataset, true)
     copied(folder / "notebooks", "*.ipynb")
     built_elsewhere(folder / "notebooks", data, folder / "report", folder / "results",

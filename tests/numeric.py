@@ -4,12 +4,14 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+from joblib import parallel_config
 from scipy.stats import t
 
-from slamlib import estimate
+from slamlib import estimate, studies
 from slamlib.core import se2
 from slamlib.core.evaluation import anees, ate, nees, nees_band
 from slamlib.core.records import ArucoReadings
+from slamlib.robust.solution_doubts import solution_doubts
 from slamlib.studies.montecarlo import antenna_error
 from slamlib.studies.simulation import PATHS, simulate
 
@@ -21,6 +23,12 @@ def short(seed, poses=None, path="short", rounds=1, **options):
     PATHS["rounds"] = replace(layout, turns=turns, poses=rounds * layout.poses)
     dataset, truth = simulate("rounds", seed, poses=poses, **options)
     return replace(dataset, name=path), truth
+
+
+def trials(trial, seeds, **options):
+    """`studies.run` in this process alone: beside it runs another one of pytest-xdist."""
+    with parallel_config("sequential"):
+        return studies.run(trial, seeds, **options)
 
 
 def central_differences(function, x, step=1e-6):
@@ -85,6 +93,11 @@ def changed(dataset, sensor, **fields):
 aruco, uwb = (partial(changed, sensor=sensor) for sensor in ("aruco", "uwb"))
 
 
+def only(dataset, rows):
+    """The Dataset with some of its sightings."""
+    return replace(dataset, aruco=dataset.aruco.select(rows))
+
+
 def vehicle(**fields):
     """A change of a Dataset: other fields of its Vehicle."""
     return lambda d: replace(d, vehicle=replace(d.vehicle, **fields))
@@ -110,9 +123,9 @@ def carried(d, begin, end):
 
 
 def seen_from(dataset, camera=(0.0, 0.0, 0.0), size=1.0):
-    """The dataset of a camera elsewhere, of larger markers."""
-    z = se2.between(np.array(camera), dataset.aruco.marker_in_vehicle)
-    covariance = se2.rotate_covariance(dataset.aruco.covariance, -camera[2])
+    """The dataset of a camera elsewhere, (3,) or one of each sighting, of larger markers."""
+    z = se2.between(camera, dataset.aruco.marker_in_vehicle)
+    covariance = se2.rotate_covariance(dataset.aruco.covariance, -np.array(camera)[..., 2])
     scale = np.array([size, size, 1])
     return aruco(dataset, marker_in_vehicle=z / scale,
                  covariance=covariance / np.outer(scale, scale))
@@ -125,13 +138,13 @@ def standing(dataset, truth, rows, count, at=0, every=1):
     """
     seen = replace(dataset.aruco, pose=dataset.aruco.pose + rows * (dataset.aruco.pose > at))
     frames = at + np.arange(every, rows + 1, every)
-    here = seen.select(seen.pose == at)
-    again = here.select(np.tile(np.arange(len(here.pose)), len(frames)))
-    z = se2.between(truth.poses[at], true_markers(truth, again.marker))
-    z += errors_of(again.covariance, np.random.default_rng(0))
-    again = replace(again, pose=np.repeat(frames, len(here.pose)), marker_in_vehicle=z)
-    joined = ArucoReadings(*(np.concatenate(each) for each in zip(
-        vars(seen).values(), vars(again).values())))
+    here = np.flatnonzero(seen.pose == at)
+    joined = seen.select(np.append(np.arange(len(seen.pose)), np.tile(here, len(frames))))
+    again = slice(len(seen.pose), None)
+    joined.pose[again] = np.repeat(frames, len(here))
+    z = se2.between(truth.poses[at], true_markers(truth, joined.marker[again]))
+    z += errors_of(joined.covariance[again], np.random.default_rng(0))
+    joined.marker_in_vehicle[again] = z
     ticks = np.insert(dataset.ticks, at + 1, np.full((rows, 2), count), axis=0)
     poses = np.insert(truth.poses, at + 1, np.tile(truth.poses[at], (rows, 1)), axis=0)
     order = np.argsort(joined.pose, kind="stable")
@@ -174,15 +187,15 @@ def slam_trial(seed, ranges=True, markers=True, **options):
                "nees between": np.nanmean(np.delete(values, frame)),
                "last nees": values[-1], "wheel nees": wheel_nees(found, truth),
                "ate": ate(found.poses, truth.poses), "slip": found.slip,
-               "factor": found.noise.sightings, "arc": found.model == "arc"}
+               "factor": found.noise.sightings, "arc": found.model == "arc",
+               "share": found.share.mean(), "doubts": len(solution_doubts(found))}
     if markers:
         off = found.marker_in_world - true_markers(truth, found.marker)
         numbers |= {"map nees": map_nees(found, truth).mean(),
                     "map worst": np.abs(off)[:, :2].max()}
     if ranges:
         error, squared = antenna_error(found, truth)
-        numbers |= {"antenna nees": np.mean(squared), "antenna error": np.sqrt(np.mean(error**2)),
-                    "doubts": len(found.doubts)}
+        numbers |= {"antenna nees": np.mean(squared), "antenna error": np.sqrt(np.mean(error**2))}
     return numbers
 
 

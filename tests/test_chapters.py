@@ -10,8 +10,8 @@ from conftest import ROOT
 CHAPTERS = sorted((ROOT / "notebooks").glob("[0-9]*.ipynb"))
 
 
-def cells_of(source, kind="code"):
-    return [cell for cell in nbformat.read(source, as_version=4).cells if cell.cell_type == kind]
+def cells_of(source):
+    return [cell for cell in nbformat.read(source, as_version=4).cells if cell.cell_type == "code"]
 
 
 def has(cell, tag):

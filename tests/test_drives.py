@@ -5,13 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import contradicted
+from numeric import short
 
 from slamlib import fuse, localize
 from slamlib.core.errors import DatasetError
 from slamlib.io.results import read_structs, read_summary
 from slamlib.notebook import Drive, attempt, drives, show_doubts, start, write_results
 from slamlib.robust.file_doubts import Doubt
-from slamlib.studies.simulation import simulate, write_dataset
+from slamlib.studies.simulation import write_dataset
 
 REASON = "expected sightings that agree"
 
@@ -28,7 +29,7 @@ def said(monkeypatch, tmp_path):
 @pytest.fixture(scope="module")
 def good():
     """A drive on which every problem can be solved."""
-    return Drive("good", simulate("short", seed=3)[0].first(100).without("uwb"), None)
+    return Drive("good", short(3, 100)[0].without("uwb"), None)
 
 
 @pytest.fixture(scope="module")
@@ -79,11 +80,10 @@ def test_doubts_are_said_with_the_name_of_the_drive(said, good):
 @pytest.fixture
 def data(monkeypatch, tmp_path, look):
     """A data folder with a simulated drive, a recorded one, and a longer one without markers."""
-    dataset, truth = simulate("short", seed=3)
+    dataset, _ = short(3, 60)
     folder = tmp_path / "data"
-    truth = replace(truth, poses=truth.poses[:30])
-    write_dataset(folder / "stand_in", dataset.first(30), truth)
-    write_dataset(folder / "wheels", dataset.first(60).without("aruco").without("uwb"), None)
+    write_dataset(folder / "stand_in", *short(3, 30))
+    write_dataset(folder / "wheels", dataset.without("aruco").without("uwb"), None)
     write_dataset(folder / "mine", dataset.first(40), None)
     monkeypatch.setenv("SLAMLIB_DATA", str(folder))
     monkeypatch.delenv("SLAMLIB_DATASETS", raising=False)

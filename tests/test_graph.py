@@ -108,7 +108,7 @@ GROUPS = [(), ("camera-offset", WHEEL_SCALE), ("marker-size", "time-offset"),
           tuple({entry.group for entry in ENTRIES} | {"antenna-offsets"})]
 
 
-@pytest.mark.parametrize("groups", GROUPS, ids=len)
+@pytest.mark.parametrize("groups", GROUPS)
 @pytest.mark.parametrize("kernel", ["asymmetric Tukey", "Cauchy"])
 def test_the_graph_is_the_one_by_which_the_engine_decides(groups, kernel):
     """Error, information and gradient, for kernels, shares, noise, jumps and any calibration."""
@@ -260,32 +260,21 @@ def test_wrong_options_of_the_plain_graph_are_told(drive, options, told):
 
 
 def test_the_plain_graph_heeds_stated_offset_and_scale_of_the_ranges(drive):
-    measured = uwb(drive[0], range=1.02 * drive[0].uwb.range + 0.5)
+    given = drive[0].uwb
+    measured = uwb(drive[0], range=2 * given.range + 0.5, sigma=2 * given.sigma)
     expected = solve_graph(*plain(drive[0]))
-    found = solve_graph(*plain(vehicle(range_offset=0.5, range_scale=1.02)(measured)))
-    assert_allclose(found.antenna_in_world, expected.antenna_in_world, atol=0.01)
+    found = solve_graph(*plain(vehicle(range_offset=0.5, range_scale=2.0)(measured)))
+    assert_allclose(found.antenna_in_world, expected.antenna_in_world, atol=1e-6)
 
 
 # What is handed in.
 
 
-def test_what_is_handed_in_is_gtsams_from_problem_1s_odometry(drive):
-    """Several steps; poses, maps and covariances are its values and marginals, and the engine's."""
-    found = estimate(known_noise(drive[0], 1e-3))
-    assert found.gtsam.start == solution.FROM_ODOMETRY and 2 <= found.gtsam.steps <= 10
-    assert found.converged and max(found.agreement) < 1e-3
-    again = solve_graph(*found.graph())
-    assert_allclose(found.poses[again.pose, :2], again.poses[:, :2], atol=1e-5)
-    sure = ~np.isin(found.antenna, [*found.doubts])
-    for C, expected in ((found.covariances[again.pose], again.covariances),
-                        (found.marker_covariance, again.marker_covariance),
-                        (found.antenna_covariance[sure], again.antenna_covariance[sure])):
-        assert_allclose(C, expected, rtol=1e-3, atol=1e-3 * expected.max())
-
-
 def test_poses_maps_and_covariances_are_those_of_gtsam(small, monkeypatch):
-    """Elsewhere, and with covariances four times as large, they are what is handed in."""
+    """From odometry; and elsewhere, with covariances four times as large, what is handed in."""
     expected = estimate(small)
+    assert expected.gtsam.start == solution.FROM_ODOMETRY and 2 <= expected.gtsam.steps <= 10
+    assert expected.converged
     solve = pipeline.solve_by_gtsam
 
     def elsewhere(fit):
@@ -338,7 +327,7 @@ def test_the_average_over_the_slip_is_that_of_the_engine():
     ({"tag_x": 0.1, "sigma_range_scale": 0.01}, (True, True, False)),
     ({"antenna_height": 1.0}, (True, True, False)),
     ({"antenna_height": 1.0, "sigma_antenna_height": 0.2, "range_offset": 0.05},
-     (True, True, False))], ids=str)
+     (True, True, False))])
 def test_with_a_calibration_that_is_stated_or_unknown_both_agree(drive, change, is_native):
     """Three markers are points. What needs no calibration has GTSAM's own factors."""
     points = np.isin(drive[0].aruco.marker, drive[0].aruco.marker[:3])
@@ -380,7 +369,10 @@ def test_poses_between_measurements_are_variables_where_they_are_asked_for(drive
     graph, values = solved.graph()
     assert values.exists(X(33)) and not values.exists(X(34))
     again = solve_graph(graph, values)
-    assert_allclose(again.poses[again.pose == 33], solved.poses[[33]], atol=1e-5)
+    assert_allclose(again.poses[:, :2], solved.poses[again.pose, :2], atol=1e-5)
+    for C, expected in ((again.covariances, solved.covariances[again.pose]),
+                        (again.marker_covariance, solved.marker_covariance)):
+        assert_allclose(C, expected, rtol=1e-3, atol=1e-3 * expected.max())
     for pose in (-1, 700, 2.5):
         with pytest.raises(DatasetError, match="estimate: expected rows from 0 to 699 for poses"):
             estimate(drive[0], poses=[pose])

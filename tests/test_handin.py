@@ -1,7 +1,6 @@
 """The zip to hand in: the assignment's files and names, and a README.txt that is true of them."""
 
 import re
-from dataclasses import replace
 from fnmatch import fnmatch
 from types import SimpleNamespace
 from zipfile import ZipFile
@@ -9,6 +8,7 @@ from zipfile import ZipFile
 import numpy as np
 import pytest
 from conftest import ROOT
+from numeric import only, short
 from test_document import text_of
 from test_report import write
 
@@ -17,7 +17,7 @@ from slamlib.core.errors import DatasetError
 from slamlib.report import handin
 from slamlib.report.notebooks import Options
 from slamlib.solve import Solution, summarize
-from slamlib.studies.simulation import simulate, write_dataset
+from slamlib.studies.simulation import write_dataset
 
 SOLVE = """from slamlib.notebook import *
 from slamlib.solve import PROBLEMS, find
@@ -27,21 +27,13 @@ for drive in start():
             write_results(drive, problem, find(problem, drive.dataset))"""
 
 
-def drive_of(name="mine", first=40):
-    """The first poses of a simulated drive, whose first sighting is at a later pose, no truth."""
-    dataset = simulate("short", seed=3)[0].first(first)
-    later = dataset.aruco.select(dataset.aruco.pose >= 10)
-    return replace(dataset, name=name, aruco=later)
-
-
 @pytest.fixture(scope="module")
 def handed(tmp_path_factory):
-    """A hand-in of a recorded dataset beside a simulated one, and what the run said."""
+    """A hand-in of a recorded dataset, first seen markers at pose 11, beside a simulated one."""
     folder = tmp_path_factory.mktemp("hand in")
-    simulated, truth = simulate("short", seed=4)
-    write_dataset(folder / "data" / "mine", drive_of())
-    write_dataset(folder / "data" / "stand_in", simulated.first(30),
-                  replace(truth, poses=truth.poses[:30]))
+    dataset, _ = short(3, 40)
+    write_dataset(folder / "data" / "mine", only(dataset, dataset.aruco.pose >= 10))
+    write_dataset(folder / "data" / "stand_in", *short(4, 30))
     write(folder / "notebooks", "B_more", "# B. More\n\nOnly if asked for.")
     write(folder / "notebooks", "1_all", "# 1. All", (SOLVE,), "## 1.1 Middle\n\nRead this.")
     (folder / "report.toml").write_text('author = "Ada"\n')

@@ -11,10 +11,12 @@ from numeric import (
     decided,
     map_nees,
     mean_nees,
+    only,
     seen_from,
     short,
     sightings,
     standing,
+    trials,
     true_markers,
     vehicle,
     wheel_nees,
@@ -22,7 +24,7 @@ from numeric import (
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.linalg import block_diag
 
-from slamlib import fuse, fuse_increments, localize, studies
+from slamlib import fuse, fuse_increments, localize
 from slamlib.core import increments, odometry, se2
 from slamlib.core.errors import DatasetError
 from slamlib.core.evaluation import anees, ate, nees
@@ -103,7 +105,7 @@ def test_monte_carlo_is_consistent():
     together with 95 % probability if each is with 1 - 0.05 / 6 (Bonferroni). The ATE is below 0.6
     of that of odometry, and the learned slip is near the truth.
     """
-    runs = studies.run(trial, range(200, 224), mislabelled=0.03)
+    runs = trials(trial, range(200, 224), mislabelled=0.03)
     for name in ("ArUco nees", "ArUco last nees", "map nees", "fused nees", "fused last nees",
                  "wheel nees"):
         assert_consistent(runs[name], probability=1 - 0.05 / 6)
@@ -160,10 +162,6 @@ def test_what_is_of_another_type_is_told(function):
 
 
 # Fused with odometry.
-
-
-def only(dataset, keep):
-    return replace(dataset, aruco=dataset.aruco.select(keep))
 
 
 @pytest.mark.parametrize("slip", [None, 2e-3])

@@ -70,10 +70,9 @@ DRIVES = {
 def numbers(drive):
     """The rows of a drive, one for each problem, as a DataFrame."""
     options, poses, change = DRIVES[drive]
-    dataset, truth = short(8, **options)
-    truth = replace(truth, poses=truth.poses[:poses])
+    dataset, truth = short(8, poses, **options)
     rows = []
-    for solution in solve.solutions(change(dataset.first(poses)), PROBLEMS):
+    for solution in solve.solutions(change(dataset), PROBLEMS):
         doubts = sorted({doubt.what for doubt in solution.doubts})
         row = {"drive": drive, "problem": solution.problem, "doubts": " ".join(doubts)}
         rows.append(solve.summarize(solution, truth) | row)

@@ -14,10 +14,10 @@ VEHICLE = Vehicle()
 BOTH = pytest.mark.parametrize("model", odometry.MODELS)
 
 
-def curvy_ticks(n=300, seed=3):
+def curvy_ticks():
     """Counts of a drive with bends, a stop, a turn on the spot and a stretch in reverse."""
-    rng = np.random.default_rng(seed)
-    ticks = rng.integers(60, 180, (n, 2))
+    rng = np.random.default_rng(3)
+    ticks = rng.integers(60, 180, (300, 2))
     ticks[0] = 0
     ticks[40:50] = 0
     ticks[80:100] = [70, -70]

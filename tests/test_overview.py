@@ -7,21 +7,20 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from numeric import short
 
 from slamlib.core import evaluation, se2
 from slamlib.notebook import Drive, plotting
 from slamlib.report import overview
 from slamlib.solve import PROBLEMS, Failure, Solution, solve_to_folder, summarize
-from slamlib.studies.simulation import simulate
 
 
 @pytest.fixture(scope="module")
 def project(tmp_path_factory):
     """Three drives, two of which lack something, with results; the solutions of the first drive."""
     folder = tmp_path_factory.mktemp("overview")
-    dataset, truth = simulate("short", seed=5)
-    dataset = replace(dataset, name="all").first(1000)
-    truth = replace(truth, poses=truth.poses[:1000])
+    dataset, truth = short(5, 1000)
+    dataset = replace(dataset, name="all")
     bare = replace(dataset.without("uwb").without("aruco"), name="wheels_only")
     given = [Drive("all", dataset, truth), Drive("no_truth", dataset, None),
              Drive("wheels_only", bare, None)]
@@ -115,13 +114,13 @@ def test_doubts_failures_and_notes_stand_on_the_first_page(project):
 
 def test_recorded_drives_are_the_subject_beside_longer_simulated_ones(project):
     simulated, recorded = project.drives[:2]
-    short = replace(recorded, name="mine", dataset=recorded.dataset.first(999))
+    mine = replace(recorded, name="mine", dataset=recorded.dataset.first(999))
     assert "Figure 1. *mine*, the longest drive." in overview.opening(
-        [short, simulated]).cells[0].source
+        [mine, simulated]).cells[0].source
 
 
 def test_errors_are_those_in_the_frame_of_the_first_pose_with_an_estimate():
-    truth = simulate("short", seed=6)[1]
+    truth = short(6)[1]
     poses = np.full_like(truth.poses, np.nan)
     poses[40:] = se2.between(truth.poses[40], truth.poses[40:])
     covariances = np.tile(np.eye(3), (len(poses), 1, 1))
@@ -150,7 +149,7 @@ def test_without_truth_there_are_no_errors(project):
 @pytest.mark.slow
 def test_at_returns_slam_is_compared_by_the_camera_that_it_estimated(tmp_path):
     """A camera 10 cm ahead, of which vehicle.toml says nothing, and the noise of sightings."""
-    dataset, truth = simulate("short", seed=5)
+    dataset, truth = short(5)
     moved = replace(dataset.vehicle, camera_x=-0.1)
     dataset = replace(dataset, aruco=replace(dataset, vehicle=moved).sightings)
     solve_to_folder(dataset, None, tmp_path, ("problem1", "problem2", "problem3"))

@@ -12,17 +12,19 @@ from numeric import (
     errors_of,
     known_noise,
     mean_nees,
+    only,
     short,
     sightings,
     sigmas,
     slam_trial,
+    trials,
     true_markers,
     vehicle,
     without_headings,
 )
 from numpy.testing import assert_allclose, assert_array_equal
 
-from slamlib import estimate, studies
+from slamlib import estimate
 from slamlib.core import odometry, se2
 from slamlib.core.errors import DatasetError
 from slamlib.core.evaluation import ate, nees_band
@@ -71,12 +73,11 @@ def test_odometry_derivatives_against_central_differences(in_counts):
 def learned_noise(seed, slip):
     """NEES and aligned ATE in m of problems 3 and 4, and of problem 3 where the noise is known."""
     dataset, truth = short(seed, slip=slip)
-    markers = dataset.without("uwb")
-    learned = estimate(markers)
-    known = estimate(known_noise(markers, slip), model="arc")
-    both = estimate(dataset, previous=learned)
+    learned, both = montecarlo.problems_3_and_4(dataset)
+    known = estimate(known_noise(dataset.without("uwb"), slip), model="arc")
     numbers = {"slip": learned.slip, "rejected": learned.rejected.sum(),
-               "arc": learned.model == "arc"}
+               "arc": learned.model == "arc",
+               "doubts": len(solution_doubts(learned) + solution_doubts(both))}
     for name, found in (("learned", learned), ("known", known), ("both", both)):
         numbers |= montecarlo.judged(name, found.poses, found.covariances, truth.poses, True)
     return numbers
@@ -89,12 +90,14 @@ def test_a_slip_that_is_not_known_widens_the_covariance(slip):
 
     A usual slip is in `test_monte_carlo_is_consistent`. The mean NEES is at most 1.35 times that
     with the slip known or 3.6, whichever is larger, and no drive is above 16. With correct labels
-    few sightings are rejected, and a large slip is learned from the typical one.
+    few sightings are rejected, nothing is doubted, and a large slip is learned from the typical
+    one.
     """
-    runs = studies.run(learned_noise, range(3000, 3008), slip=slip)
+    runs = trials(learned_noise, range(3000, 3008), slip=slip)
     most = max(1.35 * runs["known nees"].mean(), 3.6)
     for problem in ("learned nees", "both nees"):
         assert runs[problem].mean() < most and runs[problem].max() < 16
+    assert runs["doubts"].sum() == 0
     squared = (runs[["learned ate", "known ate"]]**2).mean()
     assert squared["learned ate"] < 1.3**2 * squared["known ate"]
     if slip:
@@ -157,7 +160,7 @@ def test_interpolated_poses_equal_those_of_a_graph_with_all_poses(every, sigma):
     """Frames 10 rows apart, and frames a metre apart with wheel errors that matter in between."""
     dataset = vehicle(sigma_right_radius=sigma, sigma_left_radius=sigma)(short(2, 106)[0])
     keep = dataset.aruco.pose % every == 0
-    dataset = known_noise(replace(dataset, uwb=None, aruco=dataset.aruco.select(keep)), 3e-3)
+    dataset = known_noise(only(dataset.without("uwb"), keep), 3e-3)
     sparse = estimate(dataset, model="arc")
     dense = slam_result(fit_from_odometry(measure(dataset, range(106))))
     expected = sigmas(dense.covariances)
@@ -173,13 +176,14 @@ def test_monte_carlo_is_consistent():
     NEES of graph poses, interpolated poses, markers and wheels: all four means are in their bands
     with probability 95 % (Bonferroni).
     """
-    runs = studies.run(slam_trial, range(300, 324), ranges=False, mislabelled=0.03)
+    runs = trials(slam_trial, range(300, 324), ranges=False, mislabelled=0.03)
     for name in ("nees", "nees between", "map nees", "wheel nees"):
         assert_consistent(runs[name], probability=1 - 0.05 / 4)
     assert np.sqrt(np.mean(runs["ate"]**2)) < 0.015 and runs["ate"].max() < 0.05
     assert 0.8 < np.exp(np.mean(np.log(runs["slip"]))) / 1e-3 < 1.25
     assert 0.95 < runs["factor"].mean() < 1.03
     assert runs["arc"].mean() > 0.9                      # the evidence selects the true model
+    assert (runs["share"] == 1).all()                    # no memory is found where there is none
     assert runs["map worst"].max() < 0.2                 # m: no marker is in a wrong minimum
 
 
@@ -192,7 +196,6 @@ def test_markers_of_unknown_heading_are_mapped_as_points():
     assert_allclose(found.marker_covariance[:, 2, 2], 1e4)
     off = found.marker_in_world - true_markers(truth, found.marker)
     assert np.abs(off)[:, :2].max() < 0.05
-    assert (found.marker_covariance[:, [0, 1], [0, 1]] < 0.05**2).all()
 
 
 def test_the_gate_rejects_wrong_labels_and_hardly_any_others():
@@ -210,7 +213,7 @@ def test_a_second_place_gets_a_readable_id_that_the_drive_does_not_have():
     assert_array_equal(found, [-7, 93, -107, 0, 100, 12, 212])
 
 
-@pytest.mark.parametrize("legs", [[(60, 0)], [(30, 0), (0.8, np.pi / 2), (30, 0)]], ids=str)
+@pytest.mark.parametrize("legs", [[(60, 0)], [(30, 0), (0.8, np.pi / 2), (30, 0)]])
 def test_nothing_is_released_in_a_clean_corridor(legs, monkeypatch):
     """Without a loop only what is stated gives the metre: released wheels would run away."""
     right, left = COUNT * simulation.manoeuvre(legs)[1:].T
@@ -250,20 +253,28 @@ def test_all_parts_of_a_drive_are_solved_one_after_the_other(monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("known", [
-    {"slip": 2e-3}, {"marker_noise_factor": 1.3}, {"range_noise_factor": 0.8}])
-def test_noise_that_is_known_is_not_learned_and_the_rest_is(known):
-    """By an option and by the vehicle alike, from odometry and from a result; sigmas say which."""
+@pytest.mark.parametrize("name, known", [
+    ("slip", 2e-3), ("marker_noise_factor", 1.3), ("range_noise_factor", 0.8)])
+def test_noise_that_is_known_is_not_learned_and_the_rest_is(name, known):
+    """From odometry and from a result; sigmas say which."""
     dataset, _ = short(4, 400)
-    found = estimate(dataset, **known)
-    assert_array_equal(found.poses, estimate(vehicle(**known)(dataset)).poses)
-    after = estimate(dataset, previous=estimate(dataset.without("uwb")), **known)
-    is_known = np.isin(NOISE_KEYS, [*known])
-    for each in (found, after):
-        assert_array_equal(each.noise_sigma == 0, is_known)
-        values = np.array(each.noise)
-        assert_allclose(values[is_known], [*known.values()], rtol=1e-12)
+    is_known = np.isin(NOISE_KEYS, name)
+    for before in (None, estimate(dataset.without("uwb"))):
+        found = estimate(dataset, previous=before, **{name: known})
+        assert_array_equal(found.noise_sigma == 0, is_known)
+        values = np.array(found.noise)
+        assert_allclose(values[is_known], known, rtol=1e-12)
         assert (values != [1e-3, 1, 1]).all()
+
+
+@pytest.mark.parametrize("name, value, other", [
+    ("slip", 2e-3, 1e-3), ("marker_noise_factor", 1.3, 1.0), ("range_noise_factor", 0.8, 1.0),
+    ("kernel", "Huber", "Tukey"), ("gate", False, True)])
+def test_options_are_those_of_the_vehicle_and_decide_where_both_are_given(name, value, other):
+    dataset, _ = short(4, 300, late_ranges=0.05, mislabelled=0.1)
+    found = estimate(vehicle(**{name: other})(dataset), **{name: value})
+    assert_array_equal(found.poses, estimate(vehicle(**{name: value})(dataset)).poses)
+    assert (found.poses != estimate(dataset, **{name: other}).poses).any()
 
 
 @pytest.mark.parametrize("options, told", [
@@ -279,18 +290,6 @@ def test_noise_that_is_known_is_not_learned_and_the_rest_is(known):
 def test_an_option_with_a_wrong_name_or_value_is_told_with_what_there_is(options, told):
     with pytest.raises(DatasetError, match=told):
         estimate(**{"dataset": short(4, 50)[0]} | options)
-
-
-def test_kernel_and_gate_of_the_vehicle_are_those_of_the_options():
-    """Which decide where both are given."""
-    dataset = known_noise(short(4, 400, late_ranges=0.05)[0], 1e-3)
-    stated = vehicle(kernel="Huber", gate=False)(dataset)
-    found = estimate(stated)
-    default = estimate(dataset)
-    assert_array_equal(found.poses, estimate(dataset, kernel="Huber", gate=False).poses)
-    assert_array_equal(
-        default.poses, estimate(stated, kernel="asymmetric Tukey", gate=True).poses)
-    assert (found.range_weight > 0).all() and not (default.range_weight > 0).all()
 
 
 @pytest.mark.slow
@@ -345,25 +344,11 @@ def test_the_evidence_chooses_the_steps_that_the_vehicle_drives(true, other):
         assert_array_equal(ours.weight, theirs.weight)
 
 
-def test_a_few_sightings_in_millimetres_are_rejected_and_cost_their_marker_nothing():
-    dataset, _ = short(7, 800)
-    a = dataset.aruco
-    z = a.marker_in_vehicle.copy()
-    wrong = np.flatnonzero(a.marker == a.marker[0])[:7]
-    z[wrong, :2] *= 1e-3
-    clean = fit_from_odometry(measure(dataset.without("uwb")))
-    found = fit_from_odometry(measure(aruco(dataset.without("uwb"), marker_in_vehicle=z)))
-    assert_allclose(found.state.markers, clean.state.markers, atol=0.01)
-    counts = clean.problem.accepted.sightings.weight.copy()
-    counts[wrong] = 0
-    assert_array_equal(found.problem.accepted.sightings.weight, counts)
-
-
 def test_headings_are_continuous_where_frames_are_rounds_apart():
     """Markers at both ends of three rounds only: between two frames the vehicle turns by 6 pi."""
     dataset, truth = short(5, rounds=3)
     ends = np.abs(dataset.aruco.pose - len(dataset.ticks) / 2) > len(dataset.ticks) / 2 - 50
-    found = estimate(replace(dataset, uwb=None, aruco=dataset.aruco.select(ends)))
+    found = estimate(only(dataset.without("uwb"), ends))
     assert abs(truth.poses[-1, 2]) > 18
     assert_allclose(found.poses[:, 2], truth.poses[:, 2], atol=0.3)
     assert np.abs(np.diff(found.poses[:, 2])).max() < 0.1
