@@ -76,6 +76,7 @@ MAX_CONTRADICTING = 0.01     # share of the measurements, by which a small slip 
 VISIT_GAP = 30               # typical intervals between sightings of a marker, that end a visit
 MIN_VISIT = 3                # number of accepted sightings of a visit that is compared
 MAX_REJECTED_SHARE = 0.5     # of the sightings of a visit
+MAX_SLIP_RATIO = 2.0         # of the slips with and without an explanation that is believed
 MAX_STILL_REJECTED = 0.5     # of the rejected sightings, by an explanation that is believed
 PLACE_GATE = 60.0            # squared distance of x, y, heading in sigmas, beyond it another place
 MIN_SIGMA = 0.02             # m or rad, of the path between two visits
@@ -530,15 +531,20 @@ def has_rejected_visits(fit: Fit) -> bool:
 
 
 def spares_sightings(fit: Fit | None, other: Fit, explanation: str) -> bool:
-    """Whether a Fit rejects less than MAX_STILL_REJECTED of the sightings that another rejects."""
+    """Whether a Fit rejects less than MAX_STILL_REJECTED of the sightings that another rejects.
+
+    A Fit that learns a far larger slip spares them by this slip, not by its explanation.
+    """
     if fit is None:
         return False
     factor = min(fit.problem.noise.sightings, other.problem.noise.sightings)
     still = np.count_nonzero(contradicted(fit, factor))
     without = np.count_nonzero(contradicted(other, factor))
-    is_believed = still < MAX_STILL_REJECTED * without
-    log.info("%s: %d sightings are rejected, %d without: %s", explanation, still, without,
-             "believed" if is_believed else "not believed")
+    slips = fit.problem.noise.slip > max(MIN_SHAKEN_SLIP, MAX_SLIP_RATIO * other.problem.noise.slip)
+    is_believed = still < MAX_STILL_REJECTED * without and not slips
+    log.info("%s: %d sightings are rejected, %d without, slip %.3g and %.3g mm after 1 m: %s",
+             explanation, still, without, 1e3 * fit.problem.noise.slip,
+             1e3 * other.problem.noise.slip, "believed" if is_believed else "not believed")
     return is_believed
 
 
