@@ -30,6 +30,7 @@ _MODULES = {
     "read_dataset": "io.dataset",
     "dataset_from_arrays": "io.dataset",
     "read_truth": "io.dataset",
+    "dead_reckoning": "core.odometry",
     "localize": "core.markers",
     "fuse_increments": "core.hint",
     "fuse": "robust.fused",
