@@ -28,6 +28,7 @@ from slamlib import fuse, fuse_increments, localize
 from slamlib.core import increments, odometry, se2
 from slamlib.core.errors import DatasetError
 from slamlib.core.evaluation import anees, ate, nees
+from slamlib.core.increments import TYPICAL_SLIP
 from slamlib.core.odometry import dead_reckoning
 from slamlib.solve import problem_solution
 from slamlib.studies import montecarlo
@@ -221,6 +222,11 @@ def test_slip_and_wheels_are_not_learned_from_counts_that_creep_at_a_stand(slip,
     assert_allclose(fused.wheel[:2], truth.vehicle.wheel[:2], rtol=0.01)
     assert ate(fused.poses[500:], poses[500:]) < 0.1
     assert anees(fused.poses[500:], fused.covariances[500:], poses[500:]) < most
+
+
+def test_beside_slow_errors_the_fusion_believes_no_slip_below_the_typical_one():
+    learned = [fuse(short(3, memory=memory, slip=1e-4)[0]).slip for memory in (0.0, 0.9)]
+    assert learned[0] < TYPICAL_SLIP == learned[1]
 
 
 @pytest.mark.parametrize("memory, most", [(0.0, 0.0165), (0.9, 0.0175)])

@@ -26,7 +26,8 @@ sampled data containing sequentially correlated noise, 1968).
 Nobody states the slip. So several filters run side by side, each with its slip, and the likeliest
 by its innovations is taken (multiple models: Bar-Shalom, Li and Kirubarajan 2001, section 11.6).
 Stretches of the drive tell in advance which slips are tried, the memory, the factor on the standard
-deviations of the sightings, and whether the camera is elsewhere than stated. The size of the
+deviations of the sightings, and whether the camera is elsewhere than stated. Beside slow errors, or
+larger ones than stated, no slip below the typical one is tried, as in the graph. The size of the
 markers is as stated.
 """
 
@@ -220,7 +221,9 @@ def _learned_models(dataset, jumps, slip):
     models = _all_models(slips, MEMORIES, [False, True], factors)
     best = _log_densities(_stretches(dataset), jumps, models).argmax()
     if slip is None:
-        slips = np.minimum(models.slip[best] * FINE_STEPS, SLIP_BOUNDS[1])
+        are_poor = models.memory[best] > 0 or models.factor[best] > 1    # errors of the sightings
+        least = TYPICAL_SLIP if are_poor else SLIP_BOUNDS[0]
+        slips = np.unique(np.clip(models.slip[best] * FINE_STEPS, least, SLIP_BOUNDS[1]))
     return _all_models(
         slips, [models.memory[best]], [models.elsewhere[best]], [models.factor[best]])
 
