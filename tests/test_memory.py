@@ -71,6 +71,8 @@ def test_beside_slow_errors_no_slip_below_the_typical_one_is_believed():
     assert with_hidden_errors(low, (False, True), TABLE_2).slip == 1e-3
     assert with_hidden_errors(low, (False, False), TABLE_2) == low
     assert with_hidden_errors(low, (True, True), replace(TABLE_2, slip=1e-4)) == low
+    large = low._replace(sightings=2.0)              # errors that an image's markers may share
+    assert with_hidden_errors(large, (False, False), TABLE_2) == large._replace(slip=1e-3)
 
 
 def test_slow_errors_of_a_sensor_are_no_slip():

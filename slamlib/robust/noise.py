@@ -38,6 +38,7 @@ SINGLE_POINT_SIGMA = 0.2     # of log slip, below which the mode alone is enough
 MIN_POINT_WEIGHT = 1e-3      # probability of a point; less probable ones are left out
 SINGULAR = -1e12             # log evidence of noise for which the equations are singular
 
+POOR_FACTOR = 1.5            # of sightings, above which errors may be shared
 HIDDEN_RATIO = 2.0           # largest ratio of errors with memory to what residuals show of them
 
 
@@ -46,13 +47,16 @@ def with_hidden_errors(noise: Noise, remember: Sequence[bool], vehicle: Vehicle)
 
     The factors of sightings and of ranges, where their errors `remember` (2,), are at least 1, but
     at most HIDDEN_RATIO times the learned ones. Slow errors are smoother than the shares of their
-    information say, which makes the slip look small: then it is at least the typical one. What a
-    Vehicle gives stays.
+    information say, which makes the slip look small, and so do errors that all markers of an image
+    share, for which their factor is large: then it is at least the typical one. What a Vehicle
+    gives stays.
     """
     learned = np.array([noise.sightings, noise.ranges])
     enlarged = np.maximum(learned, np.minimum(1.0, HIDDEN_RATIO * learned))
     factors = np.where(remember, enlarged, learned)
-    slip = max(noise.slip, TYPICAL_SLIP) if any(remember) else noise.slip
+    slip = noise.slip
+    if any(remember) or noise.sightings > POOR_FACTOR:
+        slip = max(slip, TYPICAL_SLIP)
     return with_known(Noise(slip, *factors.tolist()), vehicle)
 
 
