@@ -71,13 +71,15 @@ SHAKEN_SPAN = 40             # number of increments in a sum that tells slip fro
 MIN_SPANS = 3                # of these, on which it is judged
 MAX_VARIANCE_RATIO = 0.35    # of the sum, over that of independent increments
 HELD_SLIP = 3e-3             # sqrt(m), of wheels under a camera that shakes
+MAX_STILL_CONTRADICTING = 0.5    # of these, by the slip that is believed
 MAX_CONTRADICTING = 0.01     # share of the measurements, by which a small slip may contradict more
 
 VISIT_GAP = 30               # typical intervals between sightings of a marker, that end a visit
 MIN_VISIT = 3                # number of accepted sightings of a visit that is compared
 MAX_REJECTED_SHARE = 0.5     # of the sightings of a visit
 MAX_SLIP_RATIO = 2.0         # of the slips with and without an explanation that is believed
-MAX_STILL_REJECTED = 0.5     # of the rejected sightings, by an explanation that is believed
+MIN_SPARED = 2.0             # number of sightings, by each jump or place that is believed
+MAX_LOST = 0.08              # of these, number that are rejected instead
 PLACE_GATE = 60.0            # squared distance of x, y, heading in sigmas, beyond it another place
 MIN_SIGMA = 0.02             # m or rad, of the path between two visits
 
@@ -108,7 +110,7 @@ def _by_memory_or_slip(problem, state):
         return fit
     other = refine(replace(problem, memory_first=False), state)
     by_slip = _contradicting_share(other)
-    is_slip = by_slip < MAX_STILL_REJECTED * (by_memory - MAX_CONTRADICTING)
+    is_slip = by_slip < MAX_STILL_CONTRADICTING * (by_memory - MAX_CONTRADICTING)
     log.info("memory first: slip %.3g mm after 1 m, %.1f %% contradict; slip first: %.3g mm, %.1f "
              "%%: %s", 1e3 * fit.problem.noise.slip, 100 * by_memory,
              1e3 * other.problem.noise.slip, 100 * by_slip, "slip" if is_slip else "memory")
@@ -404,10 +406,11 @@ def most_consistent(
 
     `start` makes the Fit of Jumps and of places, undecided or with the decisions that another Fit
     is `like`, and `decide` decides. Jumps of odometry, or else places of ids, are believed where
-    they spare most of the sightings that are rejected without them, with the same decisions. A few
-    jumps are also believed if the evidence leads, or no marker tells them; a camera that was moved,
-    if the evidence leads. Where a solution stretches odometry beyond the slip that it learned, most
-    of all over a way without markers, one more jump is believed if the evidence leads decisively.
+    they spare sightings that are rejected without them, with the same decisions. A few jumps are
+    also believed if the evidence leads and hardly any sighting contradicts them instead, or no
+    marker tells them; a camera that was moved, if the evidence leads. Where a solution stretches
+    odometry beyond the slip that it learned, most of all over a way without markers, one more jump
+    is believed if the evidence leads decisively.
     """
     bump = camera_bump(dataset)
     fit = _with_jumps(dataset, start, decide, bump)
@@ -418,9 +421,11 @@ def most_consistent(
     if has_rejected_visits(fit):
         no_jumps = fit.problem.measurements.jumps.none()
         places = places_of_ids(dataset.aruco, partial(start, no_jumps, like=fit))
-        if places is not None and spares_sightings(
-                _alternative(start, fit, no_jumps, places), fit, "places of ids"):
-            return decide(start(no_jumps, places)), places
+        if places is not None:
+            count = len(np.unique(places[places[:, 0] != places[:, 1], 1]))
+            alternative = _alternative(start, fit, no_jumps, places)
+            if spares_sightings(alternative, fit, "places of ids", MIN_SPARED * count):
+                return decide(start(no_jumps, places)), places
     jumps = with_stretched(fit)
     if jumps is not None and _lead_of_jumps(_alternative(start, fit, jumps), fit) > MIN_JUMP_LEAD:
         return decide(start(jumps)), None
@@ -446,10 +451,16 @@ def _with_jumps(dataset, start, decide, bump):
     fit = decide(start(jumps if jumps.are_few else no_jumps))
     if jumps.are_few:
         without = _alternative(start, fit, no_jumps)
-        if _are_needless(fit, without):
-            fit = without
-    elif found and spares_sightings(_alternative(start, fit, jumps), fit, "jumps"):
-        fit = decide(start(jumps))
+        are_told = (jumps.sigma < UNKNOWN_SIGMA).all()           # by markers
+        if without is not None and are_told:
+            is_led = _lead_of_jumps(fit, without) >= MIN_JUMP_LEAD
+            least = 0 if is_led else MIN_SPARED * found
+            if not spares_sightings(fit, without, "jumps", least):
+                fit = without
+    elif found:
+        alternative = _alternative(start, fit, jumps)
+        if spares_sightings(alternative, fit, "jumps", MIN_SPARED * found):
+            fit = decide(start(jumps))
     log.info("jumps: %d of %d are believed", len(fit.problem.measurements.jumps.start), found)
     return fit
 
@@ -464,15 +475,6 @@ def _lead_of_jumps(fit, other):
         return -np.inf
     log.info("jumps: log evidence %+.1f", lead)
     return lead
-
-
-def _are_needless(fit, without):
-    """Whether the jumps of a Fit, told by markers, explain no more than a Fit without them."""
-    are_unknown = (fit.problem.measurements.jumps.sigma >= UNKNOWN_SIGMA).any()
-    if without is None or are_unknown:
-        return False
-    is_led = _lead_of_jumps(fit, without) < MIN_JUMP_LEAD
-    return is_led and not spares_sightings(fit, without, "jumps")
 
 
 def with_stretched(fit: Fit) -> Jumps | None:
@@ -530,20 +532,23 @@ def has_rejected_visits(fit: Fit) -> bool:
     return bool(most_rejected.any())
 
 
-def spares_sightings(fit: Fit | None, other: Fit, explanation: str) -> bool:
-    """Whether a Fit rejects less than MAX_STILL_REJECTED of the sightings that another rejects.
+def spares_sightings(fit: Fit | None, other: Fit, explanation: str, least: float) -> bool:
+    """Whether a Fit accepts at least so many sightings that another rejects.
 
-    A Fit that learns a far larger slip spares them by this slip, not by its explanation.
+    It may reject hardly any that the other one accepts. A Fit that learns a far larger slip spares
+    them by this slip, not by its explanation.
     """
     if fit is None:
         return False
     factor = min(fit.problem.noise.sightings, other.problem.noise.sightings)
-    still = np.count_nonzero(contradicted(fit, factor))
-    without = np.count_nonzero(contradicted(other, factor))
+    wrong = contradicted(fit, factor)
+    wrong_without = contradicted(other, factor)
+    spared = np.count_nonzero(wrong_without & ~wrong)
+    lost = np.count_nonzero(wrong & ~wrong_without)
     slips = fit.problem.noise.slip > max(MIN_SHAKEN_SLIP, MAX_SLIP_RATIO * other.problem.noise.slip)
-    is_believed = still < MAX_STILL_REJECTED * without and not slips
-    log.info("%s: %d sightings are rejected, %d without, slip %.3g and %.3g mm after 1 m: %s",
-             explanation, still, without, 1e3 * fit.problem.noise.slip,
+    is_believed = spared >= least and lost <= max(1, MAX_LOST * spared) and not slips
+    log.info("%s: spare %d sightings, lose %d, slip %.3g mm after 1 m, %.3g without: %s",
+             explanation, spared, lost, 1e3 * fit.problem.noise.slip,
              1e3 * other.problem.noise.slip, "believed" if is_believed else "not believed")
     return is_believed
 
