@@ -140,7 +140,7 @@ slamlib.estimate ="""))
     assert sum("failed" in row for row in rows.values()) == 5
     page = report.files[2].read_text(encoding="utf-8")
     text = " ".join(text_of(page).split())
-    assert "could not be solved: expected lengths" in text and "Figure 3.4. The maps" in text
+    assert "could not be solved: expected lengths" in text and "Figure 3.3. The maps" in text
     assert 'class="stderr"' not in page
 
 

@@ -26,6 +26,7 @@ from slamlib.core.records import Dataset, Truth
 from slamlib.core.sightings import sightings_by_frame
 from slamlib.robust.fit import refine
 from slamlib.robust.result import SlamResult, slam_result
+from slamlib.robust.solution_doubts import solution_doubts
 from slamlib.studies.simulation import simulate
 
 
@@ -90,7 +91,7 @@ def plain_and_delivered(seed: int, **options) -> dict:
     -------
     dict of numbers, as "plain 3 ate" and "delivered 4 ate": the ATE and the aligned ATE in m, the
     mean "nees", and the median "sigma" in m, the larger one of x and y; of the poses with a
-    measurement.
+    measurement. "delivered 3 doubts" is the number of doubts about the solution.
     """
     dataset, truth = simulate(seed=seed, **options)
     problem3, problem4 = problems_3_and_4(dataset)
@@ -102,6 +103,7 @@ def plain_and_delivered(seed: int, **options) -> dict:
             numbers |= judged(key, poses, covariances, truth.poses[at])
             numbers[f"{key} aligned"] = ate(poses, truth.poses[at], aligned=True)
             numbers[f"{key} sigma"] = np.median(position_sigmas(covariances[1:]))
+        numbers[f"delivered {problem} doubts"] = len(solution_doubts(result))
     return numbers
 
 
