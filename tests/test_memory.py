@@ -103,18 +103,12 @@ def test_a_camera_that_shakes_is_no_slip():
     assert mean_nees(found, truth) < 6           # 12
     assert "camera-shakes" in [doubt.what for doubt in solution_doubts(found)]
     assert estimate(dataset, previous=found).slip == found.slip
-    assert estimate(without, slip=1e-3).slip == 1e-3
 
 
-def test_a_large_slip_is_no_camera_that_shakes():
-    found = estimate(short(81, slip=0.04)[0].without("uwb"))
-    assert found.slip == pytest.approx(0.04, rel=0.2)
-    assert "camera-shakes" not in [doubt.what for doubt in solution_doubts(found)]
-
-
-def test_a_large_slip_is_no_slow_error_of_a_sensor():
+def test_a_large_slip_is_no_error_of_a_sensor():
     dataset, truth = short(1, slip=0.03)
     found = estimate(dataset.without("uwb"))
+    assert [doubt.what for doubt in solution_doubts(found)] == ["wheel-slip"]
     assert found.noise.sightings == pytest.approx(1, abs=0.1)
     assert found.slip == pytest.approx(0.03, rel=0.2)
     assert aligned_ate(found, truth) < 0.008     # 0.08 by memory

@@ -13,8 +13,6 @@ from slamlib.report.notebooks import Options, rendered
 from slamlib.solve import PROBLEMS, SENSORS
 
 CHAPTERS = ("[0-9A]*",)  # the problems, and the appendix on which they rely
-# The folders that are handed in: of problem 2 from markers alone, and both fusions that improve it.
-HANDED = ("problem1", "problem2", "problem2_hint", "problem2_fused", "problem3", "problem4")
 
 
 def hand_in_options(options: Options) -> Options:
@@ -32,7 +30,7 @@ def write_zip(path: Path, report: Report, results: Path, options: Options):
     for summary in report.summaries:
         folder = results / summary["dataset"]
         read_summary(folder)
-        for problem in HANDED:
+        for problem in PROBLEMS:
             for file in RESULT_FILES:
                 own = folder / problem / file
                 if own.exists():
@@ -49,6 +47,6 @@ def write_zip(path: Path, report: Report, results: Path, options: Options):
 
 def readme(summaries: list[dict], options: Options) -> str:
     """Return README.txt of drives with these summaries."""
-    text = rendered("readme.txt", cover=options, drives=summaries, handed=HANDED,
-                    problems=PROBLEMS, sensors=SENSORS)
+    text = rendered("readme.txt", cover=options, drives=summaries, problems=PROBLEMS,
+                    sensors=SENSORS)
     return re.sub("\n{3,}", "\n\n", text.strip()) + "\n"

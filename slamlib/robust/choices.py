@@ -78,8 +78,8 @@ VISIT_GAP = 30               # typical intervals between sightings of a marker, 
 MIN_VISIT = 3                # number of accepted sightings of a visit that is compared
 MAX_REJECTED_SHARE = 0.5     # of the sightings of a visit
 MAX_SLIP_RATIO = 2.0         # of the slips with and without an explanation that is believed
-MIN_SPARED = 2.0             # number of sightings, by each jump or place that is believed
-MAX_LOST = 0.08              # of these, number that are rejected instead
+MIN_SPARED = 2               # number of sightings, by each place of an id that is believed
+MAX_LOST = 0.05              # of these, number that are rejected instead
 PLACE_GATE = 60.0            # squared distance of x, y, heading in sigmas, beyond it another place
 MIN_SIGMA = 0.02             # m or rad, of the path between two visits
 
@@ -454,12 +454,12 @@ def _with_jumps(dataset, start, decide, bump):
         are_told = (jumps.sigma < UNKNOWN_SIGMA).all()           # by markers
         if without is not None and are_told:
             is_led = _lead_of_jumps(fit, without) >= MIN_JUMP_LEAD
-            least = 0 if is_led else MIN_SPARED * found
+            least = 0 if is_led else found + jumps.causes
             if not spares_sightings(fit, without, "jumps", least):
                 fit = without
     elif found:
         alternative = _alternative(start, fit, jumps)
-        if spares_sightings(alternative, fit, "jumps", MIN_SPARED * found):
+        if spares_sightings(alternative, fit, "jumps", found + jumps.causes):
             fit = decide(start(jumps))
     log.info("jumps: %d of %d are believed", len(fit.problem.measurements.jumps.start), found)
     return fit

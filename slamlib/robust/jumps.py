@@ -17,7 +17,8 @@ is from a frame to the next one, and has the number of the earlier one.
 
 import logging
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, reduce
+from operator import attrgetter
 
 import numpy as np
 
@@ -50,6 +51,7 @@ MIN_MISSED = 6               # number of sightings that should be there, and are
 # Jumps in odometry
 USUAL = 0.9                  # probability of the quantile of motions that is a usual one
 MIN_JUMP = 0.1               # m and rad, least standard deviation of the motion
+CANCELLED = 0.3              # of adjacent jumps, size of all together if frames are bad
 MAX_UNSUPPORTED = 2          # number of jumps; sensors that have more of them may be poor
 UNKNOWN_SIGMA = np.array([10.0, 10.0, np.pi])  # m, m, rad, if no marker tells
 SPIKE = 3.0                  # ratio to the counts of fast steps, above which a step is the jump
@@ -88,6 +90,12 @@ class Jumps:
         """Whether there are jumps, but few that no spike of the counts supports."""
         unsupported = np.sum(self._chances() < SPIKE_CHANCE)
         return len(self.start) > 0 and unsupported <= MAX_UNSUPPORTED
+
+    @property
+    def causes(self) -> int:
+        """Number of runs of adjacent jumps, as of wheels that slip for a while."""
+        apart = self.start[1:] > self.end[:-1]
+        return np.count_nonzero(apart) + min(len(self.start), 1)
 
     def _chances(self):
         """Chances (g,) of each whole jump."""
@@ -271,7 +279,36 @@ def _found(ticks, s, drive, slipping):
     if dead:
         unknown = dict.fromkeys(dead, 2 * _usual(drive)) | unknown
         tried = _bridged(s, drive, suspects, rank, unknown)
-    return [jump for jump in tried if jump.found]
+    return _without_bad_frames([jump for jump in tried if jump.found])
+
+
+def _without_bad_frames(found):
+    """The _Jumps but runs of adjacent ones that cancel: their frames have wrong sightings."""
+    kept = []
+    for run in _runs(sorted(found, key=attrgetter("step"))):
+        by_odometry = reduce(se2.compose, [jump.by_odometry for jump in run])
+        by_markers = reduce(se2.compose, [jump.increment for jump in run])
+        off = _size(se2.between(by_odometry, by_markers))
+        least = min(_size(jump.motion) for jump in run)
+        if len(run) == 1 or off > CANCELLED * least:
+            kept += run
+    return kept
+
+
+def _runs(found):
+    """Lists of _Jumps in adjacent steps, of those in the order of the drive."""
+    runs = []
+    for jump in found:
+        if runs and jump.step == runs[-1][-1].step + 1:
+            runs[-1].append(jump)
+        else:
+            runs.append([jump])
+    return runs
+
+
+def _size(motion):
+    """Size of a motion (3,), m, with a radian as one metre."""
+    return np.linalg.norm(distance_and_turn(motion))
 
 
 def _covariance_scale(s, drive):

@@ -7,7 +7,6 @@ test has it, `rows` computes the first two seeds of each again and compares.
 """
 
 import os
-import platform
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -60,9 +59,8 @@ def rows(name: str, trial: Callable, seeds: Sequence[int], **options) -> pd.Data
 
 
 def made_by() -> str:
-    """A line (str) with the digest of the code that computes rows, and the versions it uses."""
+    """A line (str) with the digest of the code that computes rows, and versions of packages."""
     files = sorted(file for file in SLAMLIB.rglob("*.py") if file.parent.name in COMPUTING)
     code = joblib.hash([file.read_bytes() for file in files])
     versions = [f"{package} {version(package)}" for package in ("numpy", "scipy", "gtsam")]
-    return (f"# slamlib's code {code[:12]}, Python {platform.python_version()}, "
-            f"{', '.join(versions)}\n")
+    return f"# slamlib's code {code[:12]}, {', '.join(versions)}\n"
