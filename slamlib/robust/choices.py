@@ -66,7 +66,7 @@ MAX_PROPOSALS = 5            # number of sets that are solved
 MIN_JUMP_LEAD = 10.0         # log evidence by which a jump found at the solution is believed
 
 PLAUSIBLE_FACTOR = 2.0       # on standard deviations, beyond which a sensor is not believed slow
-MIN_SHAKEN_SLIP = 0.01       # sqrt(m), of wheels that are not asked whether the camera shakes
+MIN_SHAKEN_SLIP = 0.01       # sqrt(m), from which on a camera that shakes may be the cause
 SHAKEN_SPAN = 40             # number of increments in a sum that tells slip from shaking
 MIN_SPANS = 3                # of these, on which it is judged
 MAX_VARIANCE_RATIO = 0.35    # of the sum, over that of independent increments
