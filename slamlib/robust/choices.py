@@ -79,7 +79,7 @@ MIN_VISIT = 3                # number of accepted sightings of a visit that is c
 MAX_REJECTED_SHARE = 0.5     # of the sightings of a visit
 MAX_SLIP_RATIO = 2.0         # of the slips with and without an explanation that is believed
 MIN_SPARED = 2               # number of sightings, by each place of an id that is believed
-MAX_LOST = 0.05              # of these, number that are rejected instead
+MAX_LOST = 0.1               # of these, number that may be rejected instead
 PLACE_GATE = 60.0            # squared distance of x, y, heading in sigmas, beyond it another place
 MIN_SIGMA = 0.02             # m or rad, of the path between two visits
 
