@@ -95,7 +95,7 @@ MALFORMED = {
  |  | at least the row '1 0 0', found no rows
 # nothing¶¶ |  | at least the row '1 0 0', found no rows
 pose right left¶ |  | at least the row '1 0 0', found no rows
-1 0 0 |  | a row for each pose, as there are readings of sensors, found one row
+1 0 0 |  | a row for each pose, as there are readings of later poses, found one row
 1 0 0¶2 5 | 2 | 3 numbers (pose id, right ticks, left ticks), found '2 5'
 ¶1 0¶2 0¶ | 2 | 3 numbers (pose id, right ticks, left ticks), found '1 0'
 \r\r1 0 0\r\r2 0\r | 5 | 3 numbers (pose id, right ticks, left ticks), found '2 0'

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from slamlib.core import se2
-from slamlib.core.errors import require
+from slamlib.core.errors import DatasetError, require
 from slamlib.core.records import (
     NO_RANGES,
     NO_SIGHTINGS,
@@ -101,12 +101,14 @@ def _dataset(files, vehicle, name, notes=()):
     encoders = read_table(files[ENCODER], ENCODER)
     encoders, ticks = _incremental_counts(encoders, vehicle)
     count = len(ticks)
-    has_readings = ARUCO in files or UWB in files
-    require(count > 1 or not has_readings, encoders.source,
-            "a row for each pose, as there are readings of sensors, found one row")
-    sightings = read_table(files.get(ARUCO), ARUCO, count)
+    try:
+        sightings = read_table(files.get(ARUCO), ARUCO, count)
+        ranges = read_table(files.get(UWB), UWB, count)
+    except DatasetError:
+        require(count > 1, encoders.source,
+                "a row for each pose, as there are readings of later poses, found one row")
+        raise
     guesses = read_table(files.get(GUESS), GUESS)
-    ranges = read_table(files.get(UWB), UWB, count)
     is_guessed = np.isin(ranges.numbers[:, 1], guesses.numbers[:, 0])
     ranges = ranges.drop_rows({f"an antenna id of {guesses.name}": is_guessed})
     guess = None
