@@ -22,6 +22,9 @@ FIELDS = {"vehiclePose": ("pose", "covari"), "ArucoMap": ("pose", "covari", "id"
           "UwbMap": ("position", "covariance", "id")}
 RESULT_FILES = tuple(f"{name}.mat" for name in FIELDS)  # of a problem's folder
 _HEADER = b"MATLAB 5.0 MAT-file, written by slamlib".ljust(116)  # scipy's contains the date
+FIELD_HEADER = "V56"  # bytes before the numbers of a field of a struct
+SIZE_WORD = 33  # of 4 bytes: the size of the array of structs
+COUNT_WORD = 41  # its number of columns
 
 
 def write_solution(folder: Path, solution) -> list[Path]:
@@ -81,15 +84,32 @@ def write_structs(folder: Path | str, name: str, ids: np.ndarray | None, places:
     `name` is a key of FIELDS. The ids (n,) of maps ascend, those of vehicle poses are not written;
     `places` are poses (n, 3), of markers with headings in (-pi, pi], or positions (n, 2);
     `covariances` are (n, 3, 3) or (n, 2, 2). They are NaN where there is no estimate.
+
+    scipy writes many structs slowly, one by one. Here it writes one of zeros, whose bytes are
+    repeated with the numbers: each field is a header of 56 bytes and its numbers by columns. The
+    array's size and number of columns are set (MAT-File Format, version 5).
     """
-    fields = FIELDS[name]
-    structs = np.empty((1, len(places)), [(field, object) for field in fields])
-    for field, values in zip(fields, (places, covariances, ids)):
-        structs[field][0] = [*np.asarray(values, float)]
+    count, d = np.shape(places)
+    zeros = {}
+    numbers = {}
+    entries = []
+    for field, values, shape in zip(
+            FIELDS[name], (places, covariances, ids), ((1, d), (d, d), (1, 1))):
+        zeros[field] = np.zeros(shape)
+        numbers[field] = np.reshape(values, (count, *shape))
+        entries += [(f"header of {field}", FIELD_HEADER), (field, "=f8", shape[::-1])]  # by columns
+    layout = np.dtype(entries)
     buffer = BytesIO()
-    savemat(buffer, {name: structs})
-    content = buffer.getvalue()[len(_HEADER):]
-    write_file(Path(folder) / f"{name}.mat", _HEADER + content)
+    savemat(buffer, {name: zeros})
+    content = bytearray(buffer.getvalue())
+    content[:len(_HEADER)] = _HEADER
+    structs = np.repeat(np.frombuffer(content[-layout.itemsize:], layout), count)
+    for field, values in numbers.items():
+        structs[field] = np.swapaxes(values, 1, 2)
+    words = np.frombuffer(content, "=i4", COUNT_WORD + 1)
+    words[SIZE_WORD] += (count - 1) * layout.itemsize
+    words[COUNT_WORD] = count
+    write_file(Path(folder) / f"{name}.mat", content[:-layout.itemsize] + structs.tobytes())
 
 
 def write_tum(path: Path | str, poses: np.ndarray):
