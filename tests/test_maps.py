@@ -56,6 +56,15 @@ def test_a_map_shows_path_markers_antennas_guess_truth_and_states_the_enlargemen
         assert (low < points[:, :2]).all() and (points[:, :2] < high).all()
 
 
+def test_a_map_can_be_asked_how_often_each_landmark_was_measured(solved):
+    drive, result = solved
+    ax, = maps.whole_map(drive, result).axes
+    tips = [line.get_gid() for line in ax.lines if str(line.get_gid()).startswith("tip")]
+    told = [int(tip.split()[-2]) for tip in tips]
+    assert sum(told) == len(drive.dataset.uwb.range) + np.sum(~result.rejected)
+    assert len(tips) == len(result.antenna) + len(result.marker)
+
+
 def test_ellipses_of_poses_markers_and_antennas_are_contours_of_their_own_covariances(solved):
     drive, result = solved
     result = replace(result, covariances=elongated(len(result.poses), 0.02, 0.005),

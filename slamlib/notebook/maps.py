@@ -6,6 +6,7 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
 from slamlib.core.evaluation import position_sigmas
+from slamlib.core.records import NO_RANGES
 from slamlib.notebook import plotting
 
 HALF_WIDTH, WIDTH = 4.08, 7.4      # inches: half the width of the page, and all of it
@@ -52,8 +53,11 @@ def whole_map(drive, result) -> Figure:
     plotting.legend_below(fig)
     fig.draw_without_rendering()                                  # fixes the axes for the names
     taken = []
-    for kind, letter, size, doubtful in (
-            ("antenna", "A", 9.0, result.doubts), ("marker", "", 7.0, result.unconfirmed)):
+    ranged = (drive.dataset.uwb or NO_RANGES).antenna
+    seen = result.sightings.marker[~result.rejected]
+    for kind, letter, size, doubtful, measured in (
+            ("antenna", "A", 9.0, result.doubts, ranged),
+            ("marker", "", 7.0, result.unconfirmed, seen)):
         ids = getattr(result, kind)
         places = getattr(result, f"{kind}_in_world")[:, :2]
         sigmas = 1e3 * position_sigmas(getattr(result, f"{kind}_covariance"))
@@ -63,9 +67,10 @@ def whole_map(drive, result) -> Figure:
                 name += "?"
             if letter or each in doubtful or len(ids) <= MOST_NAMES:
                 _write_name(ax, place, name, size, taken)
+            count = np.count_nonzero(measured == each)
             # Pages tell the name of this invisible disc: report.lua makes a title of it.
             ax.plot(*place, "o", alpha=0, markersize=9, zorder=9,
-                    gid=f"tip: {kind} {each}, σ {sigma:.2g} mm")
+                    gid=f"tip: {kind} {each}, σ {sigma:.2g} mm, {count} measurements")
     return fig
 
 
