@@ -10,6 +10,7 @@ import time
 from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
+from os.path import abspath
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,14 +19,9 @@ import numpy as np
 from slamlib import estimate, fuse, fuse_increments, localize
 from slamlib.core import evaluation, odometry, se2
 from slamlib.core.errors import DatasetError, require
-from slamlib.core.records import Dataset, Truth
+from slamlib.core.records import NO_RANGES, NO_SIGHTINGS, Dataset, Truth
 from slamlib.io import files, results
-from slamlib.io.dataset import (
-    inventory_lines,
-    read_dataset,
-    read_truth,
-    write_vehicle,
-)
+from slamlib.io.dataset import read_dataset, read_truth, write_vehicle
 from slamlib.robust.file_doubts import Doubt, doubts_before_solving, merged
 from slamlib.robust.result import SlamResult
 from slamlib.robust.solution_doubts import (
@@ -265,16 +261,11 @@ def _write(out, dataset, truth, found, others):
     """Write Solutions to a folder; return its summary, with the rows of `others`, too."""
     rows = others | {each.problem: summarize(each, truth) for each in found}
     (out / results.SUMMARY).unlink(missing_ok=True)
-    written = [file for problem in others for file in _result_files(out, problem)]
+    written = [file for problem in others for file in (out / problem).glob("*.mat")]
     for each in found:
         if isinstance(each, Solution):
             written += results.write_solution(out, each)
     return finish_results(out, written, dataset, truth, rows)
-
-
-def _result_files(out, problem):
-    """Paths of all files that a problem may have in a results folder."""
-    return [out / problem / name for name in results.RESULT_FILES]
 
 
 def finish_results(out: Path, written: Collection[Path], dataset: Dataset, truth: Truth | None,
@@ -285,10 +276,9 @@ def finish_results(out: Path, written: Collection[Path], dataset: Dataset, truth
     stay. The summary, by the rows (dict) of its problems and the doubts about the files, is written
     last. It also doubts a fusion of problem 2 that contradicts problem 3 where both are there.
     """
-    for problem in PROBLEMS:
-        for file in _result_files(out, problem):
-            if file not in written:
-                file.unlink(missing_ok=True)
+    for file in out.glob("problem*/*.mat"):
+        if file.name in results.RESULT_FILES and file not in written:
+            file.unlink()
     problems = {problem: rows[problem] for problem in PROBLEMS if problem in rows}
     doubts = doubts_before_solving(dataset)
     with suppress(OSError):
@@ -353,6 +343,18 @@ def _write_estimated_vehicle(path, vehicle, rows):
         write_vehicle(path, replace(vehicle, **estimated))
 
 
+def inventory_lines(dataset: Dataset, truth: Truth | None) -> list[str]:
+    """A line on what was read of a Dataset and its Truth, and one for each note."""
+    sightings = (dataset.aruco or NO_SIGHTINGS).pose
+    ranges = (dataset.uwb or NO_RANGES).pose
+    truth_is = "unknown" if truth is None else "known"
+    lines = [f"{len(dataset.ticks)} poses, {len(sightings)} sightings, {len(ranges)} ranges, "
+             f"truth {truth_is}"]
+    notes = dataset.notes + getattr(truth, "notes", ())
+    lines += [f"note: {note}" for note in notes]
+    return [f"{dataset.name}: {line}" for line in lines]
+
+
 def solve_folder(folder: Path, out: Path, problems: Collection[str] = ()) -> dict:
     """Read the dataset in a folder, solve it into the folder `out`; returns the summary.
 
@@ -391,7 +393,7 @@ def solve_folders(folders: Sequence[Path], out: Path | str, jobs: int | None = N
 
     out = Path(out)
     folders = [folder for folder in folders if not folder.is_file()]
-    by_name = {folder.absolute().name: folder for folder in folders}
+    by_name = {Path(abspath(folder)).name: folder for folder in folders}
     require(len(by_name) == len(folders), out,
             "datasets in folders of different names, as which their results are written")
 

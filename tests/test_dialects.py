@@ -12,8 +12,9 @@ from scipy.io import savemat
 from test_dataset import FILES, VEHICLE, assert_same, error_of, write
 
 from slamlib.core.vehicle import Vehicle
-from slamlib.io.dataset import dataset_from_arrays, inventory_lines, read_dataset, read_truth
+from slamlib.io.dataset import dataset_from_arrays, read_dataset, read_truth
 from slamlib.io.tables import datasets_in
+from slamlib.solve import inventory_lines
 from slamlib.studies.simulation import write_dataset
 
 folder = test_dataset.folder
@@ -95,7 +96,6 @@ MALFORMED = {
  |  | at least the row '1 0 0', found no rows
 # nothing¶¶ |  | at least the row '1 0 0', found no rows
 pose right left¶ |  | at least the row '1 0 0', found no rows
-1 0 0 |  | a row for each pose, as there are readings of later poses, found one row
 1 0 0¶2 5 | 2 | 3 numbers (pose id, right ticks, left ticks), found '2 5'
 ¶1 0¶2 0¶ | 2 | 3 numbers (pose id, right ticks, left ticks), found '1 0'
 \r\r1 0 0\r\r2 0\r | 5 | 3 numbers (pose id, right ticks, left ticks), found '2 0'
@@ -122,7 +122,7 @@ a;b;c¶1;0;0¶2;;12 | 3 | right ticks, a whole number from -1e+15 to 1e+15, foun
 """,
     "UwbReading.txt": """
 0 3 1 1¶1 3 1 1 | 1 | pose ids from 1 on, found '0 3 1 1'
-a;b¶¶1;3;nan;1¶1;3;2,5;1¶9;3;1,5;1 | 5 | pose id, a whole number from 1 to 4, found '9 3 1.5 1'
+a;b¶¶1;3;nan;1¶1;3;2,5;1¶9;3;1,5;1 | 5 | a whole number from 1 to 4 (the rows of the encoder)
 1,3,1,5,0,1 | 1 | 4 numbers (pose id, antenna id, range, sigma), found '1,3,1,5,0,1'
 1a 3b 1.5c 0.1d¶1 3 1 1 | 1 | range, sigma), found '1a 3b 1.5c 0.1d'
 1,3,1.5,0.1¶2,3 1.6,0.1 | 2 | 4 numbers (pose id, antenna id, range, sigma), found '2,3 1.6,0.1'
@@ -183,11 +183,11 @@ ArucoReading.txt | 1 40 0 0 0 1 1 0 1 0 1 | a positive definite covariance (smal
 ArucoReading.txt | 1 40 0 0 0 1e-4 2e-4 0 1e-4 0 1e4 | a positive definite covariance
 ArucoReading.txt | 1 40 0 0 0 1 .9 -.9 1 .9 1 | a positive definite covariance
 ArucoReading.txt | 1 40 0 0 0 1 9e14 0 1 0 1e-18 | a positive definite covariance
-ArucoReading.txt | 301 40 0 0 0 1 0 0 1 0 1 | pose id, a whole number from 1 to 300, found '301 40
+ArucoReading.txt | 301 40 0 0 0 1 0 0 1 0 1 | pose id, a whole number from 1 to 300 (the rows
 ArucoReading.txt | 1 40 0 inf 0 1 0 0 1 0 1 | y, a finite number from -10000 to 10000 m, found
 ArucoReading.txt | 1 4.5 0 0 0 1 0 0 1 0 1 | marker id, a whole number from -1e+15 to 1e+15, found
 UwbReading.txt | 1 5 -5.1 1 | a range that is not below -5 sigma, found '1 5 -5.1 1'
-UwbReading.txt | 301 5 1 1 | pose id, a whole number from 1 to 300, found '301 5 1 1'
+UwbReading.txt | 301 5 1 1 | pose id, a whole number from 1 to 300 (the rows of
 UwbReading.txt | 1 5 1 0 | sigma, a finite number from 1e-09 to 10000 m, found '1 5 1 0'
 UwbReading.txt | 1 3.5 1 1 | antenna id, a whole number from -1e+15 to 1e+15, found '1 3.5 1 1'
 """)

@@ -14,10 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from slamlib.core import se2
-from slamlib.core.errors import DatasetError, require
+from slamlib.core.errors import require
 from slamlib.core.records import (
-    NO_RANGES,
-    NO_SIGHTINGS,
     AntennaGuess,
     ArucoReadings,
     Dataset,
@@ -101,13 +99,8 @@ def _dataset(files, vehicle, name, notes=()):
     encoders = read_table(files[ENCODER], ENCODER)
     encoders, ticks = _incremental_counts(encoders, vehicle)
     count = len(ticks)
-    try:
-        sightings = read_table(files.get(ARUCO), ARUCO, count)
-        ranges = read_table(files.get(UWB), UWB, count)
-    except DatasetError:
-        require(count > 1, encoders.source,
-                "a row for each pose, as there are readings of later poses, found one row")
-        raise
+    sightings = read_table(files.get(ARUCO), ARUCO, count)
+    ranges = read_table(files.get(UWB), UWB, count)
     guesses = read_table(files.get(GUESS), GUESS)
     is_guessed = np.isin(ranges.numbers[:, 1], guesses.numbers[:, 0])
     ranges = ranges.drop_rows({f"an antenna id of {guesses.name}": is_guessed})
@@ -175,10 +168,8 @@ def _incremental_counts(table, vehicle):
 def _unwrapped(counts):
     """Counts (n, 2) less the modulus, where that makes them as small as most others."""
     large = np.quantile(abs(counts), 0.9)
-    if MIN_MODULUS_RATIO * large >= MODULUS:
-        return counts
     less = counts - np.sign(counts) * MODULUS
-    is_wrapped = abs(less) <= 2 * large
+    is_wrapped = (abs(less) <= 2 * large) & (MIN_MODULUS_RATIO * large < MODULUS)
     return np.where(is_wrapped, less, counts)
 
 
@@ -220,15 +211,3 @@ def read_truth(folder: Path | str) -> Truth | None:
     notes = tuple(f"In truth: {note}" for note in notes)
     return Truth(poses, markers.ids(0), marker_in_world, antennas.ids(0), antenna_in_world,
                  vehicle, notes)
-
-
-def inventory_lines(dataset: Dataset, truth: Truth | None) -> list[str]:
-    """A line on what was read of a Dataset and its Truth, and one for each note."""
-    sightings = (dataset.aruco or NO_SIGHTINGS).pose
-    ranges = (dataset.uwb or NO_RANGES).pose
-    truth_is = "unknown" if truth is None else "known"
-    lines = [f"{len(dataset.ticks)} poses, {len(sightings)} sightings, {len(ranges)} ranges, "
-             f"truth {truth_is}"]
-    notes = dataset.notes + getattr(truth, "notes", ())
-    lines += [f"note: {note}" for note in notes]
-    return [f"{dataset.name}: {line}" for line in lines]

@@ -95,7 +95,7 @@ def read_table(source: Path | Table | None, name: str, pose_count: int | None = 
         table = _table_of_text(source, limits, name == GUESS)
     most = 0
     if pose_count is not None:
-        limits = limits | {"pose id": Limit(1, pose_count, whole=True)}
+        limits = limits | {"pose id": Limit(1, pose_count, "(the rows of the encoder)", whole=True)}
         is_complete = ~np.isnan(table.numbers).any(axis=1)
         if name == UWB:
             is_complete &= table.numbers[:, 2] != 0

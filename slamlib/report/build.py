@@ -12,13 +12,12 @@ import nbformat
 
 from slamlib.core.errors import DatasetError, require
 from slamlib.io import files
-from slamlib.io.dataset import inventory_lines
 from slamlib.io.results import SUMMARY, read_summary
 from slamlib.io.tables import datasets_in
 from slamlib.notebook.drives import read_drives
 from slamlib.report import cache
 from slamlib.report.notebooks import Options, read_books
-from slamlib.solve import SENSORS, finish_results
+from slamlib.solve import SENSORS, finish_results, inventory_lines
 
 # Name of the file in a report that has a digest and lists its files; all others are the user's.
 PAGES = ".pages"
