@@ -185,7 +185,15 @@ def test_rows_that_repeat_count_once_with_a_note(folder):
     found = read_dataset(folder)
     assert found.uwb.range.tolist() == [-0.05, 1.5, 1.2]            # noise may make one negative
     assert found.notes == ("UwbReading.txt: 1 of 4 rows left out, the first in line 3: expected "
-                           "each row only once, found '2 3 1.5 0.1'.",)
+                           "each reading only once, found '2 3 1.5 0.1'.",)
+
+
+def test_a_sighting_that_a_detector_repeats_at_later_poses_counts_once_with_a_note(folder):
+    seen = "0.4 0.1 0.2 1e-4 0 0 1e-4 0 1e-4"
+    write(folder / "ArucoReading.txt", f"1 40 {seen}\n2 40 {seen}\n3 41 {seen}\n4 40 {seen}\n")
+    found = read_dataset(folder)
+    assert found.aruco.pose.tolist() == [0, 2]
+    assert "2 of 4 rows left out, the first in line 2: expected each reading only" in found.notes[0]
 
 
 # Limits; test_dialects.py has numbers beyond them.

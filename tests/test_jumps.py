@@ -212,6 +212,16 @@ def test_sightings_that_are_late_are_no_jumps_and_start_at_their_delay(stated):
     assert ate(found.poses, path) < 3e-3 and found.rejected.mean() < 0.01
 
 
+def test_images_that_are_late_alone_or_in_a_row_are_no_jumps():
+    """Odometry contradicts their sightings where they begin and, the other way, where they end."""
+    clean = short(seed=21)[0].without("uwb")
+    image = clean.aruco.pose // 10                       # 10 poses from one to the next
+    late = np.isin(image, [20, 40, 60, 80, 100, 120, 121, 122, 140, 160])
+    readings = replace(clean.aruco, pose=clean.aruco.pose + np.where(late, 6, 0))
+    assert len(jumps.find_jumps(replace(clean, aruco=readings)).start) == 0
+
+
+
 @pytest.mark.parametrize("change", [
     lambda a: a, lambda a: replace(a, covariance=a.covariance / 16),
     lambda a: replace(a, pose=a.pose + 8).select(a.pose < a.pose.max() - 8),

@@ -51,7 +51,8 @@ MIN_MISSED = 6               # number of sightings that should be there, and are
 # Jumps in odometry
 USUAL = 0.9                  # probability of the quantile of motions that is a usual one
 MIN_JUMP = 0.1               # m and rad, least standard deviation of the motion
-CANCELLED = 0.3              # of adjacent jumps, size of all together if frames are bad
+MAX_BAD_FRAMES = 10          # in a row
+CANCELLED = 0.3              # of jumps before and after them, size of all together
 MAX_UNSUPPORTED = 2          # number of jumps; sensors that have more of them may be poor
 UNKNOWN_SIGMA = np.array([10.0, 10.0, np.pi])  # m, m, rad, if no marker tells
 SPIKE = 3.0                  # ratio to the counts of fast steps, above which a step is the jump
@@ -279,31 +280,42 @@ def _found(ticks, s, drive, slipping):
     if dead:
         unknown = dict.fromkeys(dead, 2 * _usual(drive)) | unknown
         tried = _bridged(s, drive, suspects, rank, unknown)
-    return _without_bad_frames([jump for jump in tried if jump.found])
+    found = [jump for jump in tried if jump.found]
+    return _without_bad_frames(drive, found + _beside(s, drive, found, rank))
 
 
-def _without_bad_frames(found):
-    """The _Jumps but runs of adjacent ones that cancel: their frames have wrong sightings."""
+def _beside(s, drive, found, rank):
+    """List of each _Jump in a step beside those that were `found`, as behind a late frame."""
+    steps = np.array([jump.step for jump in found], int)
+    beside = np.setdiff1d([steps - 1, steps + 1], steps)
+    beside = beside[(beside >= 0) & (beside < len(rank))]
+    moved = reduce(_Drive.with_jump, found, drive)
+    return [jump for jump in _bridged(s, moved, beside, rank, {}) if jump.found]
+
+
+def _without_bad_frames(drive, found):
+    """The _Jumps but those that soon cancel: in between, sightings are wrong, or late."""
     kept = []
-    for run in _runs(sorted(found, key=attrgetter("step"))):
-        by_odometry = reduce(se2.compose, [jump.by_odometry for jump in run])
-        by_markers = reduce(se2.compose, [jump.increment for jump in run])
-        off = _size(se2.between(by_odometry, by_markers))
-        least = min(_size(jump.motion) for jump in run)
-        if len(run) == 1 or off > CANCELLED * least:
-            kept += run
+    for jump in sorted(found, key=attrgetter("step")):
+        kept.append(jump)
+        for k in reversed(range(len(kept))):
+            if jump.step - kept[k].step > MAX_BAD_FRAMES:
+                break
+            if _cancel(drive, kept[k:]):
+                del kept[k:]
+                break
     return kept
 
 
-def _runs(found):
-    """Lists of _Jumps in adjacent steps, of those in the order of the drive."""
-    runs = []
-    for jump in found:
-        if runs and jump.step == runs[-1][-1].step + 1:
-            runs[-1].append(jump)
-        else:
-            runs.append([jump])
-    return runs
+def _cancel(drive, run):
+    """Whether _Jumps move what follows by far less than each of them does."""
+    first = run[0].step
+    last = run[-1].step + 1
+    moved = reduce(_Drive.with_jump, run, drive)
+    off = se2.between(se2.between(drive.poses[first], drive.poses[last]),
+                      se2.between(moved.poses[first], moved.poses[last]))
+    least = min(_size(jump.motion) for jump in run)
+    return _size(off) < CANCELLED * least
 
 
 def _size(motion):
