@@ -191,3 +191,10 @@ def test_moved_markers_are_landmarks_of_their_own():
     both = estimate(dataset, previous=result)
     assert_array_equal(both.places, result.places)
     assert aligned_ate(both, truth) < 0.01
+
+
+def test_several_ranges_of_an_antenna_at_a_pose_have_no_lag():
+    drive, truth = short(seed=21, poses=400)
+    twice = drive.uwb.select(np.repeat(np.arange(len(drive.uwb.range)), 2))
+    found = estimate(replace(drive, uwb=twice))
+    assert ate(found.poses, truth.poses) < 0.05

@@ -59,7 +59,7 @@ def runs(landmark: np.ndarray, pose: np.ndarray, max_pause: float) -> tuple[floa
     """
     interval = np.diff(pose)
     same = landmark[1:] == landmark[:-1]
-    typical = np.median(interval[same])
+    typical = np.maximum(np.median(interval[same]), 1)   # a pose may have several
     begins = ~same | (interval > max_pause * typical)
     return typical, np.cumulative_sum(begins, include_initial=True)
 
