@@ -104,9 +104,8 @@ def _wheel_variances(ticks, vehicle):
     """Variances (n-1, 2, 1, 2) in m^2 of e_R and e_L, by rounding and by a slip of 1 sqrt(m)."""
     step = odometry.steps(ticks, vehicle)
     around = vehicle.wheelbase / 2 * step.dtheta
-    metres_per_count = 2 * np.pi * vehicle.wheel[:2] / vehicle.ticks_per_revolution
     variance = np.empty((len(around), 2, 1, 2))
-    variance[:, 0, 0] = metres_per_count**2 / 6
+    variance[:, 0, 0] = vehicle.metres_per_count**2 / 6
     variance[:, 1, 0, 0] = np.abs(step.ds + around)
     variance[:, 1, 0, 1] = np.abs(step.ds - around)
     return variance

@@ -66,6 +66,11 @@ class Vehicle:
         return np.array([self.sigma_right_radius, self.sigma_left_radius, self.sigma_wheelbase])
 
     @property
+    def metres_per_count(self) -> np.ndarray:
+        """Ways of the right and the left wheel in one encoder count, (2,) in m."""
+        return 2 * np.pi * self.wheel[:2] / self.ticks_per_revolution
+
+    @property
     def camera(self) -> np.ndarray:
         """Pose [x, y, turn] of the camera in the vehicle, (3,) in m and rad."""
         return np.array([self.camera_x, self.camera_y, self.camera_turn])

@@ -68,7 +68,7 @@ MIN_JUMP_LEAD = 10.0         # log evidence by which a jump found at the solutio
 PLAUSIBLE_FACTOR = 2.0       # on standard deviations, beyond which a sensor is not believed slow
 MIN_SHAKEN_SLIP = 0.01       # sqrt(m), from which on a camera that shakes may be the cause
 SHAKEN_SPAN = 40             # number of increments in a sum that tells slip from shaking
-MIN_SPANS = 3                # of these, on which it is judged
+MIN_SHAKEN_SPANS = 3         # of these, on which it is judged
 MAX_VARIANCE_RATIO = 0.35    # of the sum, over that of independent increments
 HELD_SLIP = 3e-3             # sqrt(m), of wheels under a camera that shakes
 MAX_STILL_CONTRADICTING = 0.5    # of these, by the slip that is believed
@@ -131,14 +131,12 @@ def is_shaken(fit: Fit) -> bool:
         return False
     error = odometry_error(problem.odometry, fit.state.poses, fit.state.c[WHEELS])[0]
     sigma = np.sqrt(problem.odometry.covariance(slip)[:, 0, 0])
-    vehicle = problem.measurements.dataset.vehicle
-    count = 2 * np.pi * vehicle.right_radius / vehicle.ticks_per_revolution      # m
-    if np.median(sigma) < count:
+    if np.median(sigma) < problem.measurements.dataset.vehicle.metres_per_count.max():
         return False
     along = error[:, 0] / sigma
     total = cumulative(along)
     sums = total[SHAKEN_SPAN:] - total[:-SHAKEN_SPAN]
-    if len(sums) < MIN_SPANS * SHAKEN_SPAN:
+    if len(sums) < MIN_SHAKEN_SPANS * SHAKEN_SPAN:
         return False
     ratio = np.mean(sums**2) / (SHAKEN_SPAN * np.mean(along**2))
     return bool(ratio < MAX_VARIANCE_RATIO)

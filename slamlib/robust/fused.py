@@ -70,6 +70,7 @@ class LearnedFusion(Fusion):
     wheel: np.ndarray                # (3,) m, R_R, R_L, b
     wheel_covariance: np.ndarray     # (3, 3) m^2
     memory: float                    # correlation of the errors of a marker in successive frames
+    factor: float                    # on the standard deviations of the sightings
     camera: np.ndarray               # (3,) m and rad, x, y, turn
     jumps: Jumps                     # without whose counts it does
 
@@ -166,6 +167,7 @@ def fuse(dataset: Dataset, slip: float | None = None) -> LearnedFusion:
         wheel=dataset.vehicle.wheel + x[-1, 1],
         wheel_covariance=P[-1, WHEELS, WHEELS],
         memory=float(models.memory[best]),
+        factor=float(models.factor[best]),
         camera=x[-1, 2],
         jumps=jumps)
 
