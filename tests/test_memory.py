@@ -9,7 +9,7 @@ from numeric import aligned_ate, aruco, mean_nees, short, sightings, trials, uwb
 from numpy.testing import assert_allclose, assert_array_equal
 
 from slamlib import estimate
-from slamlib.core.evaluation import nees_band
+from slamlib.core.evaluation import ate, nees_band
 from slamlib.core.vehicle import TABLE_2
 from slamlib.robust.choices import _squared_distance, visits
 from slamlib.robust.error_memory import error_memory
