@@ -12,7 +12,8 @@ that is off by c = [x, y, turn] changes the position of an increment [p, h] by
 
 For each moment, weighted least squares tell c before and after it, and how much smaller the squared
 residuals are than with one c (generalised likelihood ratio: Basseville and Nikiforov,
-Detection of Abrupt Changes, 1993, section 2.4).
+Detection of Abrupt Changes, 1993, section 2.4). Where a change of the delay in addition makes them
+decidedly smaller, the clocks moved instead: later sightings get the pose ids of their time.
 
 Where wheels slip on a patch of the ground, both seem to have other radii there. The stretch is the
 one with the greatest likelihood ratio, and its counts are not used.
@@ -53,6 +54,9 @@ MAX_STRETCH = 0.5         # of the drive, in which wheels are exchanged; else th
 MIN_BUMP_GAIN = 35.0      # of squared residuals, by a camera that was moved
 MAX_BUMP = 0.3            # m and rad, of a motion of the camera
 BUMP_SIGMA = 0.2          # m and rad, of a camera about its stated place, before and after
+DELAY_SIGMA = 10.0        # encoder steps, of a delay before and after
+MIN_DELAY_GAIN = 6.0      # of squared residuals, by a change of the delay beside the camera's,
+MIN_GAIN_RATIO = 1.2      # to which that of the camera alone is compared
 REWEIGHTED = 4            # times, by the residuals
 MIN_WHEELS_GAIN = 25.0    # of squared residuals, by other wheels in a stretch
 STRETCH_LENGTHS = 30      # number of lengths that are tried
@@ -249,7 +253,7 @@ def camera_bump(dataset: Dataset) -> CameraBump | None:
     markers, wheels, sigma, poses = moving_increments(dataset, signs=(1,))
     if len(wheels) <= 2 * MIN_COUNT:
         return None
-    k, motion, gain = _moved_camera(markers[0], wheels, sigma)
+    k, motion, gain = _change(markers[0], wheels, sigma, _by_camera(wheels))
     if gain < MIN_BUMP_GAIN or np.abs(motion).max() > MAX_BUMP:
         return None
     s = sightings_by_frame(dataset.sightings)
@@ -270,33 +274,94 @@ def camera_bump(dataset: Dataset) -> CameraBump | None:
     return bump
 
 
-def _moved_camera(markers, wheels, sigma):
-    """Number of the first increment after the camera moved, its motion (3,), and the gain.
+class LaterDelay(NamedTuple):
+    """A change of the delay of the sightings during a drive."""
 
-    By increments (n, 3) of markers and wheels, and sigmas (n, 2) of distance and turn by markers.
-    Wheels may be off by one factor all the time. The gain is that of squared residuals, in the
-    variance that the residuals show.
-    """
-    e = se2.difference(markers, wheels)[:, :2, None]
+    pose: int                # pose id, from 0, from which on it is larger
+    steps: int               # by so many encoder steps, below 0 if it is smaller
+
+    def mended(self, dataset: Dataset) -> Dataset:
+        """The Dataset with the pose ids that its later sightings had before the change."""
+        aruco = dataset.aruco
+        pose = aruco.pose - np.where(aruco.pose >= self.pose, self.steps, 0)
+        pose = np.clip(pose, 0, len(dataset.ticks) - 1)
+        in_order = replace(aruco, pose=pose).select(np.argsort(pose, kind="stable"))
+        return replace(dataset, aruco=in_order)
+
+
+def later_delay(dataset: Dataset) -> LaterDelay | None:
+    """The LaterDelay of a Dataset, or None if the camera's place explains the sightings as well."""
+    markers, wheels, sigma, poses = moving_increments(dataset, signs=(1,))
+    if len(wheels) <= 2 * MIN_COUNT:
+        return None
+    path = odometry.dead_reckoning(dataset.ticks, dataset.vehicle, model="arc")
+    last = len(path) - 1
+
+    def increments_late_by(steps):
+        taken = np.clip(poses - steps, 0, last)
+        return se2.between(path[taken[:, 0]], path[taken[:, 1]])
+
+    by_step = se2.difference(increments_late_by(1), increments_late_by(-1)) / 2
+    by_camera = _by_camera(wheels)
+    by_delay = DELAY_SIGMA / BUMP_SIGMA * by_step[:, :2, None]
+    _, _, least = _change(markers[0], wheels, sigma, by_camera)
+    k, change, gain = _change(
+        markers[0], wheels, sigma, np.concatenate([by_camera, by_delay], axis=2))
+    steps = round(DELAY_SIGMA / BUMP_SIGMA * change[3])
+    if gain < MIN_GAIN_RATIO * least + MIN_DELAY_GAIN or steps == 0:
+        return None
+
+    def cost(delay):
+        """Squared residuals, up to a limit, if it is mended."""
+        by_wheels = increments_late_by(np.where(poses >= delay.pose, delay.steps, 0))
+        squared = np.sum((markers[0] - by_wheels)[:, :2]**2, axis=1) / sigma[:, 0]**2
+        return np.minimum(squared, GATE).sum()
+
+    near = np.unique(poses[max(k - 2 * OVERLAP, 0):k + 2 * OVERLAP])
+    delays = {steps - 1, steps, steps + 1} - {0}
+    found = min((LaterDelay(int(pose), each) for pose in near for each in delays), key=cost)
+    log.info("sightings: from pose %d on %d steps later", found.pose + 1, found.steps)
+    return found
+
+
+def mended(dataset: Dataset) -> Dataset:
+    """The Dataset with its wheels mended, and then the pose ids of later sightings."""
+    dataset = with_wheels_mended(dataset)
+    delay = later_delay(dataset)
+    return dataset if delay is None else delay.mended(dataset)
+
+
+def _by_camera(wheels):
+    """Derivatives (n, 2, 3) of the positions of increments (n, 3) by the camera's [x, y, turn]."""
     turned = se2.rotation(wheels[:, 2]) - np.eye(2)
     across = np.stack([wheels[:, 1], -wheels[:, 0]], axis=1)
-    by_camera = np.concatenate([turned, across[:, :, None]], axis=2)
+    return np.concatenate([turned, across[:, :, None]], axis=2)
+
+
+def _change(markers, wheels, sigma, by_change):
+    """Number of the first increment after a change, the change (q,), and the gain.
+
+    By increments (n, 3) of markers and wheels, sigmas (n, 2) of distance and turn by markers, and
+    derivatives (n, 2, q) of positions by what changes. Wheels may be off by one factor all the
+    time. The gain is that of squared residuals, in the variance that the residuals show.
+    """
+    e = se2.difference(markers, wheels)[:, :2, None]
     by_factor = wheels[:, :2, None]
-    J = np.concatenate([by_camera, by_factor], axis=2)
+    J = np.concatenate([by_change, by_factor], axis=2)
     variance = sigma[:, 0]**2 / 2
     weight = 1 / variance
     for _ in range(REWEIGHTED):
         weighted = weight[:, None, None] * J.mT
         common, _ = _least_squares(np.sum(weighted @ J, axis=0), np.sum(weighted @ e, axis=0))
-        left = e - by_factor * common[3]
-        information = np.cumsum(weighted[:, :3] @ by_camera, axis=0)
-        right = np.cumsum(weighted[:, :3] @ left, axis=0)
+        left = e - by_factor * common[-1]
+        information = np.cumsum(weighted[:, :-1] @ by_change, axis=0)
+        right = np.cumsum(weighted[:, :-1] @ left, axis=0)
         before, saved_before = _least_squares(information, right)
         after, saved_after = _least_squares(information[-1] - information, right[-1] - right)
         gain = saved_before + saved_after - saved_before[-1]
         k = MIN_COUNT + int(gain[MIN_COUNT:-MIN_COUNT].argmax())
-        camera = np.where((np.arange(len(e)) <= k)[:, None, None], before[k], after[k])
-        squared = np.sum((left - by_camera @ camera)**2, axis=(1, 2)) / variance
+        changed = np.where((np.arange(len(e)) <= k)[:, None, None], before[k], after[k])
+        squared = np.sum((left - by_change @ changed)**2, axis=(1, 2)) / variance
         weight = _robust_weights(squared, _scale(squared, 2)) / variance
     return k + 1, (after[k] - before[k])[:, 0], gain[k] / OVERLAP
 
