@@ -106,7 +106,7 @@ def test_monte_carlo_is_consistent():
     together with 95 % probability if each is with 1 - 0.05 / 6 (Bonferroni). The ATE is below 0.6
     of that of odometry, and the learned slip is near the truth.
     """
-    runs = trials(trial, range(200, 224), poses=700, mislabelled=0.03)
+    runs = trials(trial, range(200, 224), mislabelled=0.03)
     for name in ("ArUco nees", "ArUco last nees", "map nees", "fused nees", "fused last nees",
                  "wheel nees"):
         assert_consistent(runs[name], probability=1 - 0.05 / 6)
@@ -114,7 +114,7 @@ def test_monte_carlo_is_consistent():
         assert np.median(runs[f"{method} ate"] / runs["odometry ate"]) < 0.6
         assert decided(0.6**2 * runs["odometry ate"]**2 - runs[f"{method} ate"]**2)
     assert decided(runs["ArUco ate"]**2 - runs["fused ate"]**2)
-    assert np.sqrt(np.mean(runs["ArUco ate"]**2)) < 0.035                       # m, on 7 m
+    assert np.sqrt(np.mean(runs["ArUco ate"]**2)) < 0.1                         # m, on 20 m
     assert 0.8 < np.exp(np.mean(np.log(runs["slip"]))) / 1e-3 < 1.25
 
 
@@ -215,7 +215,7 @@ def test_sightings_that_are_not_used_are_counted():
     (4e-4, 1e-4, 16), (5e-3, 1e-4, 16), (1e-3, 0.01, 6)])
 def test_slip_and_wheels_are_not_learned_from_counts_that_creep_at_a_stand(slip, sigma, most):
     """Wheels known well, or to a tenth; 500 frames that would say that they do not turn."""
-    dataset, truth = short(3, slip=slip)
+    dataset, truth = short(3, 1000, slip=slip)
     stands, poses = standing(dataset, truth, rows=500, count=2)
     fused = fuse(vehicle(sigma_right_radius=sigma, sigma_left_radius=sigma)(stands))
     assert 0.7 < fused.slip / slip < 1.5

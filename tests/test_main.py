@@ -94,7 +94,9 @@ SOLVE = ["solve", "good", "--out", "out"]
     (["solve", "good"], "--out"),
     ([*SOLVE, "--problem", "3"], "expected the measurements of problem3"),
     ([*SOLVE, "more"], "unrecognized arguments: more"),
+    (["solve", "a/good", "good", "--out", "out"], "datasets in folders of different names"),
     (["report", "medium", "good", "--data", "."], ": expected one of bad, good, found 'medium'"),
+    (["report", "bad", "--data", "."], "bad/encoderReading.txt, line 2: expected "),
     (["report", "--out", "."], "unrecognized arguments: --out"),
 ])
 def test_bad_arguments_give_exit_code_2_and_one_sentence(tmp_path, monkeypatch, capsys, arguments,

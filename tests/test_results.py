@@ -208,11 +208,6 @@ def test_several_drives_have_a_table_and_one_that_fails_does_not_stop_them(
     assert table.failed.notna().tolist() == [False, True, False]
 
 
-def test_several_drives_of_the_same_name_are_refused(tmp_path, capsys):
-    assert main(["solve", "a/drive", "b/drive", "--out", str(tmp_path)]) == 2
-    assert "expected datasets in folders of different names" in capsys.readouterr().err
-
-
 @pytest.mark.slow
 def test_drives_are_solved_on_a_local_dask_cluster(tmp_path, drive):
     """As docs/use.md shows it; the table is that of one process."""

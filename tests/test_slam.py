@@ -20,14 +20,13 @@ from numeric import (
     trials,
     true_markers,
     vehicle,
-    without_headings,
 )
 from numpy.testing import assert_allclose, assert_array_equal
 
 from slamlib import estimate
 from slamlib.core import odometry, se2
 from slamlib.core.errors import DatasetError
-from slamlib.core.evaluation import ate, nees_band
+from slamlib.core.evaluation import ate
 from slamlib.core.kernels import KERNELS, ONE_SIDED_BIAS
 from slamlib.core.records import AntennaGuess, Dataset, UwbReadings
 from slamlib.core.sightings import sightings_by_frame
@@ -187,17 +186,6 @@ def test_monte_carlo_is_consistent():
     assert runs["map worst"].max() < 0.2                 # m: no marker is in a wrong minimum
 
 
-def test_markers_of_unknown_heading_are_mapped_as_points():
-    """The headings of the sightings are uniform, and their variances are large."""
-    dataset, truth = short(4)
-    found = estimate(replace(dataset, uwb=None, aruco=without_headings(dataset.aruco)))
-    assert ate(found.poses, truth.poses) < 0.03 and found.rejected.mean() < 0.01
-    assert mean_nees(found, truth) < nees_band(1, probability=0.999)[1]
-    assert_allclose(found.marker_covariance[:, 2, 2], 1e4)
-    off = found.marker_in_world - true_markers(truth, found.marker)
-    assert np.abs(off)[:, :2].max() < 0.05
-
-
 def test_the_gate_rejects_wrong_labels_and_hardly_any_others():
     dataset, _ = short(6, mislabelled=0.03)
     wrong = dataset.aruco.marker != short(6)[0].aruco.marker
@@ -271,7 +259,7 @@ def test_noise_that_is_known_is_not_learned_and_the_rest_is(name, known):
     ("slip", 2e-3, 1e-3), ("marker_noise_factor", 1.3, 1.0), ("range_noise_factor", 0.8, 1.0),
     ("kernel", "Huber", "Tukey"), ("gate", False, True)])
 def test_options_are_those_of_the_vehicle_and_decide_where_both_are_given(name, value, other):
-    dataset, _ = short(4, 300, late_ranges=0.05, mislabelled=0.1)
+    dataset, _ = short(4, 300, late_ranges=0.05, mislabelled=0.03)
     found = estimate(vehicle(**{name: other})(dataset), **{name: value})
     assert_array_equal(found.poses, estimate(vehicle(**{name: value})(dataset)).poses)
     assert (found.poses != estimate(dataset, **{name: other}).poses).any()

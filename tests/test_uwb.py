@@ -191,7 +191,7 @@ def test_an_antenna_without_a_guess_is_told():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("first, right, options", [
-    (0, 0.95, dict(error=10.0)),
+    (0, 0.95, dict(error=10.0, poses=1000)),
     (3000, 0, dict(late_ranges=0.15, error=2.0, poses=400, markers=False)),
     (3000, 0, dict(late_ranges=0.3, error=5.0, poses=800))])
 def test_every_wrong_antenna_is_in_doubt_or_inside_its_ellipse(first, right, options):
