@@ -88,12 +88,12 @@ def copied(target, chapters, first=None):
         nbformat.write(book, target / source.name)
 
 
-def contradicted(aruco):
-    """ArucoReadings with a second place for every sighting: problem 2 cannot be solved."""
+def contradicted(dataset):
+    """The Dataset with a second place for every sighting: problem 2 cannot be solved."""
     import numpy as np
-    twice = aruco.select(np.repeat(np.arange(len(aruco.pose)), 2))
-    off = np.resize([[0.0, 0.0, 0.0], [5.0, 3.0, 1.0]], twice.marker_in_vehicle.shape)
-    return replace(twice, marker_in_vehicle=twice.marker_in_vehicle + off)
+    twice = dataset.aruco.select(np.repeat(np.arange(len(dataset.aruco.pose)), 2))
+    twice.marker_in_vehicle[1::2] += [5.0, 3.0, 1.0]
+    return replace(dataset, aruco=twice)
 
 
 def file_names(folder):
