@@ -12,6 +12,7 @@ from numeric import (
     aruco,
     as_points,
     central_differences,
+    counts,
     mean_nees,
     seen_from,
     short,
@@ -219,17 +220,12 @@ def test_a_wrong_statement_is_named_alone_and_mended_and_not_taken_for_slip(what
     assert antenna_error(both, truth)[1].mean() < 8
 
 
-def counted(dataset, factor):
-    """The Dataset with counts times a factor, a number or (n, 1)."""
-    return replace(dataset, ticks=np.rint(dataset.ticks * factor).astype(int))
-
-
 @pytest.mark.slow
 def test_wheels_that_only_ranges_contradict_are_told_from_the_scale_of_ranges():
     """The offset and scale of the ranges are two entries that nobody stated; turns tell them."""
     dataset, truth = drive(11)
     dataset = dataset.without("aruco")
-    found = estimate(counted(dataset, 1.03))
+    found = estimate(counts(slice(None), lambda ticks: np.rint(1.03 * ticks))(dataset))
     assert named(found) <= {"wheel-scale", "wheel-radii"} and named(found)
     assert_right(found, truth, 1.5 * aligned_ate(estimate(dataset), truth))
 

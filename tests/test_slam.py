@@ -259,7 +259,7 @@ def test_noise_that_is_known_is_not_learned_and_the_rest_is(name, known):
     ("slip", 2e-3, 1e-3), ("marker_noise_factor", 1.3, 1.0), ("range_noise_factor", 0.8, 1.0),
     ("kernel", "Huber", "Tukey"), ("gate", False, True)])
 def test_options_are_those_of_the_vehicle_and_decide_where_both_are_given(name, value, other):
-    dataset, _ = short(4, 300, late_ranges=0.05, mislabelled=0.03)
+    dataset, _ = short(4, 300, late_ranges=0.05, mislabelled=0.1)
     found = estimate(vehicle(**{name: other})(dataset), **{name: value})
     assert_array_equal(found.poses, estimate(vehicle(**{name: value})(dataset)).poses)
     assert (found.poses != estimate(dataset, **{name: other}).poses).any()
