@@ -68,7 +68,7 @@ def test_offsets_of_the_camera_have_the_standard_deviations_that_they_state():
     """Eight clean drives of two slips, with a camera and a delay that are hardly known."""
     time, place = [], []
     for seed in range(8):
-        dataset, _ = short(seed, 1000, slip=1e-3 + 2e-3 * (seed % 2))
+        dataset, _ = short(seed, slip=1e-3 + 2e-3 * (seed % 2))
         found = estimate(vehicle(
             sigma_sighting_lag=10.0, sigma_camera_x=0.2, sigma_camera_y=0.2,
             sigma_camera_turn=0.2)(dataset.without("uwb")))

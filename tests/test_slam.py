@@ -71,7 +71,7 @@ def test_odometry_derivatives_against_central_differences(in_counts):
 
 def learned_noise(seed, slip):
     """NEES and aligned ATE in m of problems 3 and 4, and of problem 3 where the noise is known."""
-    dataset, truth = short(seed, 1000, slip=slip)
+    dataset, truth = short(seed, slip=slip)
     learned, both = montecarlo.problems_3_and_4(dataset)
     known = estimate(known_noise(dataset.without("uwb"), slip), model="arc")
     numbers = {"slip": learned.slip, "rejected": learned.rejected.sum(),

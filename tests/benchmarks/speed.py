@@ -55,13 +55,12 @@ def plain(folder):
 def pairs(count=PAIRS):
     """Print the times of `solve` and of the plain script on data/long, one after the other."""
     print(f"solve {LONG.name}, all problems, whole process, beside the plain script's problem 4")
-    print(f"{'load':>6}{'solve (s)':>12}{'plain (s)':>12}{'ratio':>8}")
+    print(f"{'solve (s)':>12}{'plain (s)':>12}{'ratio':>8}")
     ratios = []
     for _ in range(count):
-        load = os.getloadavg()[0]
         (ours, parts), theirs = solve(LONG), plain(LONG)
         ratios.append(ours / theirs)
-        print(f"{load:6.2f}{ours:12.2f}{theirs:12.2f}{ours / theirs:8.2f}", flush=True)
+        print(f"{ours:12.2f}{theirs:12.2f}{ours / theirs:8.2f}", flush=True)
     print(f"median ratio {np.median(ratios):.2f}; of the last run: " + ", ".join(
         f"{name} {seconds:.2f} s" for name, seconds in parts.items()))
 
