@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -23,10 +22,8 @@ from numpy.testing import assert_allclose
 
 from slamlib import estimate, fuse, fuse_increments, localize
 from slamlib.core import se2
-from slamlib.core.evaluation import align, ate
 from slamlib.core.odometry import dead_reckoning
 from slamlib.core.vehicle import Vehicle
-from slamlib.io.dataset import read_dataset, read_truth
 from slamlib.robust import calibration, choices
 from slamlib.robust.calibration import (
     CAMERA,
@@ -313,30 +310,3 @@ def test_problem_2_and_the_checks_of_files_see_by_the_stated_camera():
     assert doubts_before_solving(spoilt) and not doubts_before_solving(stated)
     for solve in (lambda d: localize(d.sightings), fuse, fuse_increments):
         assert_allclose(solve(stated).poses, solve(dataset).poses, atol=1e-9)
-
-
-LOGS = Path(__file__).parents[2] / "shared" / "real_logs"             # where they are present
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not LOGS.is_dir(), reason="the public robot logs are not here")
-@pytest.mark.parametrize("log, solve, largest, what", [
-    ("enmt", fuse, 1.34, None), ("starloc_b", fuse, 0.12, None), ("walker3", fuse, 0.052, None),
-    ("litw", fuse, 1.74, None), ("starloc_b", estimate, 0.015, "marker-size"),
-    ("mrclam_b", estimate, 0.1, "camera-offset")])
-def test_on_public_logs_errors_are_small_and_covered(log, solve, largest, what):
-    """AprilTags with ranges, printed too large; a vehicle that stands first; a camera elsewhere."""
-    count = 6500 if what else 13_000
-    dataset = read_dataset(LOGS / log).first(count)
-    truth = read_truth(LOGS / log).poses[:count]
-    found = solve(dataset)
-    assert ate(found.poses, truth, aligned=True) < largest
-    T = align(found.poses, truth)
-    later = slice(len(truth) // 10, None)
-    off = (se2.compose(T, found.poses) - truth)[later, :2]
-    C = se2.rotate_covariance(found.covariances, T[2])[later, :2, :2]
-    assert np.median(se2.squared_norms(off, C)) < 3
-    if what:
-        assert what in found.released
-    else:
-        assert found.rejected < 0.05 * len(dataset.aruco.pose)
