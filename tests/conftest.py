@@ -21,8 +21,8 @@ settings.load_profile("short")           # another one by `pytest --hypothesis-p
 
 ROOT = Path(__file__).parents[1]
 # By the seconds of processors that they take: several processes take one file after the other.
-FIRST = ("test_studies", "test_pages", "test_calibration", "test_slam", "test_uwb", "test_jumps",
-         "test_localization", "test_properties")
+FIRST = ("test_studies", "test_pages", "test_slam", "test_localization", "test_calibration",
+         "test_uwb", "test_jumps", "test_properties")
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 
