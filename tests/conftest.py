@@ -21,9 +21,8 @@ settings.load_profile("short")           # another one by `pytest --hypothesis-p
 
 ROOT = Path(__file__).parents[1]
 # By the seconds of processors that they take: several processes take one file after the other.
-FIRST = ("test_studies", "test_pages", "test_slam", "test_calibration", "test_localization",
-         "test_uwb", "test_jumps", "test_memory", "test_results",
-         "test_properties")
+FIRST = ("test_studies", "test_pages", "test_slam", "test_localization", "test_calibration",
+         "test_uwb", "test_jumps", "test_properties")
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 
@@ -89,12 +88,12 @@ def copied(target, chapters, first=None):
         nbformat.write(book, target / source.name)
 
 
-def contradicted(aruco):
-    """ArucoReadings with a second place for every sighting: problem 2 cannot be solved."""
+def contradicted(dataset):
+    """The Dataset with a second place for every sighting: problem 2 cannot be solved."""
     import numpy as np
-    twice = aruco.select(np.repeat(np.arange(len(aruco.pose)), 2))
-    off = np.resize([[0.0, 0.0, 0.0], [5.0, 3.0, 1.0]], twice.marker_in_vehicle.shape)
-    return replace(twice, marker_in_vehicle=twice.marker_in_vehicle + off)
+    twice = dataset.aruco.select(np.repeat(np.arange(len(dataset.aruco.pose)), 2))
+    twice.marker_in_vehicle[1::2] += [5.0, 3.0, 1.0]
+    return replace(dataset, aruco=twice)
 
 
 def file_names(folder):
@@ -136,7 +135,7 @@ def report_on_all(tmp_path_factory, kept):
     import numpy as np
     from numeric import only
 
-    from slamlib.studies.simulation import manoeuvre, simulate, write_dataset
+    from slamlib.studies.simulation import simulate, write_dataset
     folder = tmp_path_factory.mktemp("built")
     data = folder / "data"
     shutil.copytree(ROOT / "data", data, ignore=lambda *_: ["long"])
@@ -148,7 +147,6 @@ def report_on_all(tmp_path_factory, kept):
             ("new seed", new, truth), ("no_truth", new, None), ("wheels_only", bare, None),
             ("waits", replace(bare, ticks=np.r_[np.zeros((100, 2)), bare.ticks[:200]]), None),
             ("one_pose", bare.first(1), None),
-            ("backs_up", replace(bare, ticks=np.rint(manoeuvre([(2, 1.0), (-2, 0.5)]))), None),
             ("one_sighting", only(new, [0]), truth),
             ("sparse", only(new, sparse), truth)):
         write_dataset(data / name, dataset, true)

@@ -153,8 +153,7 @@ def standing(dataset, truth, rows, count, at=0, every=1):
 
 def known_noise(dataset, slip):
     """The Dataset of a drive with this slip in sqrt(m), and the noise that its files state."""
-    return replace(dataset, vehicle=replace(
-        dataset.vehicle, slip=slip, marker_noise_factor=1.0, range_noise_factor=1.0))
+    return vehicle(slip=slip, marker_noise_factor=1.0, range_noise_factor=1.0)(dataset)
 
 
 def map_nees(found, truth):

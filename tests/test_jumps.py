@@ -1,6 +1,7 @@
 """Increments of odometry that contradict the markers: found, freed, bridged and told."""
 
 from dataclasses import replace
+from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
@@ -31,6 +32,7 @@ from slamlib.robust.fused import fuse
 from slamlib.robust.solution_doubts import _encoder_doubts, solution_doubts
 from slamlib.studies.simulation import TABLE_2, manoeuvre, simulate
 
+drive = cache(simulate)
 MARKERS = np.array([[1.0, 0.0, 0.3], [0.5, 0.8, -2.0], [0.0, -1.0, 1.0]])
 
 
@@ -230,7 +232,7 @@ def test_images_that_are_late_alone_or_in_a_row_are_no_jumps():
     {}, {"slip": 0.0}, {"slip": 1e-2}, {"mislabelled": 0.03}])
 def test_no_jump_in_clean_drives(change, options):
     for path, seed in (("short", 0), ("short", 1), ("short", 2), ("long", 0)):
-        dataset, _ = simulate(path, seed=seed, **options)
+        dataset, _ = drive(path, seed=seed, **options)
         assert not len(jumps.find_jumps(replace(dataset, aruco=change(dataset.aruco))).start)
 
 

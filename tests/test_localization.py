@@ -36,7 +36,7 @@ from slamlib.studies.simulation import TABLE_2
 
 
 def test_perfect_data_give_the_exact_poses_map_and_wheels():
-    dataset, truth = short(1, noise=False)
+    dataset, truth = short(1, 1000, noise=False)
     for each in (fuse(dataset, slip=1e-3), fuse(dataset)):
         assert_allclose(each.poses, truth.poses, atol=1e-9)
         assert_allclose(each.wheel, [0.1, 0.1, 0.4], atol=1e-9)
@@ -198,7 +198,7 @@ def test_sightings_that_are_not_used_are_counted():
 
     The hint uses no sighting of a marker that no adjacent frame sees, on the clean drive either.
     """
-    dataset, _ = short(1, noise=False)
+    dataset, _ = short(1, 1000, noise=False)
     a = dataset.aruco
     seen_before = [np.flatnonzero((a.pose == pose) & np.isin(
         a.marker, a.marker[a.pose == pose - 10]))[0] for pose in range(200, 900, 100)]
@@ -215,7 +215,7 @@ def test_sightings_that_are_not_used_are_counted():
     (4e-4, 1e-4, 16), (5e-3, 1e-4, 16), (1e-3, 0.01, 6)])
 def test_slip_and_wheels_are_not_learned_from_counts_that_creep_at_a_stand(slip, sigma, most):
     """Wheels known well, or to a tenth; 500 frames that would say that they do not turn."""
-    dataset, truth = short(3, slip=slip)
+    dataset, truth = short(3, 1000, slip=slip)
     stands, poses = standing(dataset, truth, rows=500, count=2)
     fused = fuse(vehicle(sigma_right_radius=sigma, sigma_left_radius=sigma)(stands))
     assert 0.7 < fused.slip / slip < 1.5
@@ -225,7 +225,7 @@ def test_slip_and_wheels_are_not_learned_from_counts_that_creep_at_a_stand(slip,
 
 
 def test_beside_slow_errors_the_fusion_believes_no_slip_below_the_typical_one():
-    learned = [fuse(short(3, memory=memory, slip=1e-4)[0]).slip for memory in (0.0, 0.9)]
+    learned = [fuse(short(3, 1000, memory=memory, slip=1e-4)[0]).slip for memory in (0.0, 0.9)]
     assert learned[0] < TYPICAL_SLIP == learned[1]
 
 

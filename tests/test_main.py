@@ -94,7 +94,9 @@ SOLVE = ["solve", "good", "--out", "out"]
     (["solve", "good"], "--out"),
     ([*SOLVE, "--problem", "3"], "expected the measurements of problem3"),
     ([*SOLVE, "more"], "unrecognized arguments: more"),
+    (["solve", "a/good", "good", "--out", "out"], "datasets in folders of different names"),
     (["report", "medium", "good", "--data", "."], ": expected one of bad, good, found 'medium'"),
+    (["report", "bad", "--data", "."], "bad/encoderReading.txt, line 2: expected "),
     (["report", "--out", "."], "unrecognized arguments: --out"),
 ])
 def test_bad_arguments_give_exit_code_2_and_one_sentence(tmp_path, monkeypatch, capsys, arguments,
@@ -136,7 +138,7 @@ def test_notes_and_doubts_are_said_and_in_the_summary(tmp_path, drive, capsys):
 
 def test_a_problem_that_fails_costs_the_others_nothing(tmp_path, capsys, drive):
     """Every marker is seen twice at a pose, at two places, and neither is confirmed."""
-    write_dataset(tmp_path / "drive", replace(drive[0], aruco=contradicted(drive[0].aruco)))
+    write_dataset(tmp_path / "drive", contradicted(drive[0]))
     problems = solved(tmp_path, code=3)["problems"]
     assert [*problems] == list(solve.PROBLEMS)
     failed = [name for name, row in problems.items() if "failed" in row]

@@ -117,13 +117,6 @@ def test_unknown_model_is_refused():
         odometry.dead_reckoning(curvy_ticks(), VEHICLE, model="midpoint")
 
 
-def test_a_single_pose_has_the_initial_covariance():
-    for function in (odometry.equation2, odometry.first_order):
-        poses, covariances = function(np.zeros((1, 2), int), VEHICLE)
-        assert_array_equal(poses, [[0, 0, 0]])
-        assert_array_equal(covariances, [np.diag([0, 0, 1e-8])])
-
-
 # Increments between any two poses, and their noise.
 
 

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from numeric import short
+from numeric import seen_from, short
 
 from slamlib.core import evaluation, se2
 from slamlib.notebook import Drive, plotting
@@ -150,8 +150,7 @@ def test_without_truth_there_are_no_errors(project):
 def test_at_returns_slam_is_compared_by_the_camera_that_it_estimated(tmp_path):
     """A camera 10 cm ahead, of which vehicle.toml says nothing, and the noise of sightings."""
     dataset, truth = short(5)
-    moved = replace(dataset.vehicle, camera_x=-0.1)
-    dataset = replace(dataset, aruco=replace(dataset, vehicle=moved).sightings)
+    dataset = seen_from(dataset, (0.1, 0.0, 0.0))
     solve_to_folder(dataset, None, tmp_path, ("problem1", "problem2", "problem3"))
     drive = overview.solved_drive(Drive("x", dataset, None), tmp_path)
     rows, text = result_rows(overview.opening([drive]))

@@ -12,7 +12,6 @@ from kills import contents
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 
 from slamlib.__main__ import main
-from slamlib.core.errors import DatasetError
 from slamlib.io.files import write_file
 from slamlib.report.build import build_report
 from slamlib.report.notebooks import NotebookError, Options, read_options
@@ -119,14 +118,6 @@ def test_a_notebook_that_fails_is_named_and_leaves_the_old_report(
     assert re.fullmatch(told, str(caught.value))
     assert contents(tmp_path / "report") == {"1_good.html": b"old"}
     assert file_names(tmp_path / "results") == results
-
-
-def test_bad_data_is_told_before_a_kernel_starts(tmp_path):
-    make_data(tmp_path)
-    write(tmp_path / "notebooks", "1_text", "# Text", ("raise SystemExit('never reached')",))
-    (tmp_path / "data" / "long" / "encoderReading.txt").write_text("1 0 0\n2 1\n")
-    with pytest.raises(DatasetError, match="encoderReading.txt, line 2: expected 3 numbers"):
-        build(tmp_path)
 
 
 @pytest.mark.parametrize("content, reason", [

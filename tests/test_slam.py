@@ -20,14 +20,13 @@ from numeric import (
     trials,
     true_markers,
     vehicle,
-    without_headings,
 )
 from numpy.testing import assert_allclose, assert_array_equal
 
 from slamlib import estimate
 from slamlib.core import odometry, se2
 from slamlib.core.errors import DatasetError
-from slamlib.core.evaluation import ate, nees_band
+from slamlib.core.evaluation import ate
 from slamlib.core.kernels import KERNELS, ONE_SIDED_BIAS
 from slamlib.core.records import AntennaGuess, Dataset, UwbReadings
 from slamlib.core.sightings import sightings_by_frame
@@ -185,17 +184,6 @@ def test_monte_carlo_is_consistent():
     assert runs["arc"].mean() > 0.9                      # the evidence selects the true model
     assert (runs["share"] == 1).all()                    # no memory is found where there is none
     assert runs["map worst"].max() < 0.2                 # m: no marker is in a wrong minimum
-
-
-def test_markers_of_unknown_heading_are_mapped_as_points():
-    """The headings of the sightings are uniform, and their variances are large."""
-    dataset, truth = short(4)
-    found = estimate(replace(dataset, uwb=None, aruco=without_headings(dataset.aruco)))
-    assert ate(found.poses, truth.poses) < 0.03 and found.rejected.mean() < 0.01
-    assert mean_nees(found, truth) < nees_band(1, probability=0.999)[1]
-    assert_allclose(found.marker_covariance[:, 2, 2], 1e4)
-    off = found.marker_in_world - true_markers(truth, found.marker)
-    assert np.abs(off)[:, :2].max() < 0.05
 
 
 def test_the_gate_rejects_wrong_labels_and_hardly_any_others():

@@ -38,7 +38,6 @@ from slamlib.robust.initialization import (
 )
 from slamlib.robust.linear import consistency_factor
 from slamlib.robust.measurements import Accepted, measure
-from slamlib.solve import problem_solution
 from slamlib.studies import comparisons
 from slamlib.studies.simulation import manoeuvre
 
@@ -156,11 +155,10 @@ def test_problem_4_from_problem_3_is_that_from_odometry(late):
 
 
 def test_late_ranges_only_are_down_weighted_and_counted(late):
-    dataset, off, found = late
+    _, off, found = late
     assert (found.range_weight[off > 8] < 0.1).all() and (off > 8).sum() > 8
     assert np.mean(found.range_weight[off == 0] > 0.5) > 0.98
     assert 0.08 < np.mean(found.range_weight < 0.5) < 0.2
-    assert len(problem_solution("problem4", dataset, found).maps["UwbMap"][1]) == 4
 
 
 @pytest.mark.slow
@@ -193,7 +191,7 @@ def test_an_antenna_without_a_guess_is_told():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("first, right, options", [
-    (0, 0.95, dict(error=10.0)),
+    (0, 0.95, dict(error=10.0, poses=1000)),
     (3000, 0, dict(late_ranges=0.15, error=2.0, poses=400, markers=False)),
     (3000, 0, dict(late_ranges=0.3, error=5.0, poses=800))])
 def test_every_wrong_antenna_is_in_doubt_or_inside_its_ellipse(first, right, options):
