@@ -7,7 +7,13 @@ import nbformat
 import pytest
 from conftest import ROOT
 
-CHAPTERS = sorted((ROOT / "notebooks").glob("[0-9]*.ipynb"))
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+CHAPTERS = [source for source in NOTEBOOKS if source.name[0].isdigit()]
+LABEL = r"(?:\d+\.\d+|[A-Z]\.\d+|\d\b|[A-Z]\b)"
+REFERENCE = re.compile(  # to a label such as 2.3 or A, which begins with its chapter
+    r"(?i:(chapter|section|table|figure|equation|appendix)s?)\s"
+    rf"({LABEL}(?:(?:,| and| to)+ {LABEL})*)")
+REMARK = re.compile(r"\[\([^\]]*\)\]\([^)]*\.ipynb\)")  # the report has it with its notebook only
 
 
 def cells_of(source):
@@ -31,6 +37,21 @@ def test_sections_figures_and_tables_are_numbered_in_order_and_try_it_is_last(so
         assert found == [f"{source.name[0]}.{n}" for n in range(1, len(found) + 1)], kind
     first = next(i for i, cell in enumerate(cells) if cell.source.startswith("## Try it"))
     assert [has(cell, "lab-only") for cell in cells] == [i >= first for i in range(len(cells))]
+
+
+@pytest.mark.parametrize("source", NOTEBOOKS, ids=lambda path: path.stem)
+def test_no_chapter_speaks_of_one_that_may_be_left_out_where_it_is_not(source):
+    books = {path.name[0]: nbformat.read(path, as_version=4) for path in NOTEBOOKS}
+    needs = {key: book.metadata.get("slamlib", {}).get("needs") for key, book in books.items()}
+    own = source.name[0]
+    text = "\n".join(cell.source for cell in books[own].cells
+                     if cell.cell_type == "markdown" and not has(cell, "lab-only"))
+    referred = set()
+    for kind, labels in REFERENCE.findall(REMARK.sub("", text)):
+        for label in re.findall(LABEL, labels):
+            if "." in label or kind.lower() in ("chapter", "appendix"):
+                referred.add(label[0])
+    assert referred >= {own} and {needs[key] for key in referred} <= {None, needs[own]}
 
 
 def numbers_of(kind, text):

@@ -114,6 +114,15 @@ def test_links_lead_to_other_chapters_by_their_file_and_anchor():
     assert b"https://example.org/p" in content and b"notes.txt" not in content
 
 
+def test_a_remark_in_a_link_is_in_the_report_if_its_chapter_is(tmp_path):
+    text = "Enough. [(See chapter 2.)](2_two.ipynb) [(See 3.)](3_x.ipynb)"
+    found, content = page(text)
+    assert "See" not in words(found) and "See" not in text_of(content, tmp_path)
+    found, content = pages({ONE: titled("1. One", text), TWO: titled("2. Two")})
+    assert "(See chapter 2.)" in words(found["1"]) and "See 3" not in words(found["1"])
+    assert "(See chapter 2.)" in text_of(content, tmp_path)
+
+
 @pytest.mark.parametrize("cells, reason", [
     ([figure("Figure 1.1. A."), figure("Figure 1.1. B.")], "figure 1.1 occurs twice"),
     (["$$ a \\tag{3} $$ and $$ b \\tag{3} $$"], "equation 3 occurs twice"),
@@ -155,6 +164,13 @@ def test_every_formula_arrives_with_its_number(tmp_path):
     assert "$" not in left and "\\" not in left
     text = text_of(content, tmp_path)
     assert re.search(r"\s\(1\.1\)\s", text) and re.search(r"\s\(7\)\s", text)
+
+
+def test_parts_of_a_formula_may_break_on_pages():
+    found, _ = page(r"$$ a = \begin{cases} 1 & \quad x \\ 2 & \quad y \end{cases}, \qquad b, "
+                    r"\qquad c \tag{1.1} $$")
+    assert found.count('class="keep"') == found.count("<math") == 3
+    assert found.count('class="number"') == 1
 
 
 def test_wide_formulas_shrink_and_long_tables_break(tmp_path):

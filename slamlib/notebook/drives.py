@@ -52,8 +52,7 @@ def read_drives(data: Path, selected: list[str] | None = None) -> list[Drive]:
     if a dataset is not there or does not follow the format.
     """
     names, _ = datasets_in(data, selected)
-    folders = [data / name for name in names]
-    drives = [Drive(each.name, read_dataset(each), read_truth(each)) for each in folders]
+    drives = [Drive(name, read_dataset(data / name), read_truth(data / name)) for name in names]
     drives.sort(key=lambda drive: (drive.origin == "simulated", len(drive.dataset.ticks)))
     return drives if selected else without_stand_ins(drives)
 
@@ -63,8 +62,8 @@ def without_stand_ins(drives: list[Drive]) -> list[Drive]:
     return [drive for drive in drives if drive.origin != "simulated"] or drives
 
 
-def start(sensor: str | None = None) -> list[Drive]:
-    """List of the drives with a sensor, "aruco" or "uwb", as `read_drives` has them.
+def start(sensor: str = "ticks") -> list[Drive]:
+    """List of the drives with a sensor, "ticks", "aruco" or "uwb", as `read_drives` has them.
 
     The environment variable SLAMLIB_DATA names the data folder; by default it is the nearest `data`
     in this folder or above it. SLAMLIB_DATASETS selects datasets by name, one a line. Also sets the
@@ -74,8 +73,7 @@ def start(sensor: str | None = None) -> list[Drive]:
     plotting.use_style()
     selected = os.environ.get("SLAMLIB_DATASETS", "")
     drives = read_drives(_data_folder(), selected.splitlines())
-    if sensor:
-        drives = [drive for drive in drives if getattr(drive.dataset, sensor) is not None]
+    drives = [drive for drive in drives if getattr(drive.dataset, sensor) is not None]
     require(drives, _data_folder(), f"a dataset with {solve.SENSORS.get(sensor)}, found none")
     return drives
 

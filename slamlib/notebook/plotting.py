@@ -53,7 +53,7 @@ ROLES = {
     "true place": _sign("black", "+", 5, zorder=6),
 }
 STYLE = Path(__file__).with_name("slamlib.mplstyle")  # for matplotlib.style
-MAX_SEMI_AXIS = 0.08         # of enlarged 95 % ellipses, in the larger extent of the path
+MAX_SEMI_AXIS = 0.04         # of enlarged 95 % ellipses, in the larger extent of the path
 MAX_BANDS = 800              # poses at which errors are drawn
 
 
@@ -163,9 +163,7 @@ def own_axes(ax: Axes, covariance: np.ndarray, points: np.ndarray, **look) -> Ax
     variances, directions = np.linalg.eigh(covariance[:2, :2])
     in_own_axes = np.diag(variances[::-1])                               # along, across
     places = points[:, :2] @ directions[:, ::-1]
-    centre = np.zeros((1, 2))
-    color = ROLES["odometry"]["color"]
-    ellipses(ax, centre, in_own_axes[None], color)
+    ellipses(ax, np.zeros((1, 2)), in_own_axes[None], ROLES["odometry"]["color"])
     ax.plot(places[:, 0], places[:, 1], **ROLES["true place"] | look)
     ax.set(xlabel="along the ellipse", ylabel="across")
     for axis in (ax.xaxis, ax.yaxis):
@@ -177,8 +175,8 @@ def trajectory(ax: Axes, poses: np.ndarray, role: str, label: str | None = None,
     """Draw the path of poses (n, >= 2) with a dot at its start and equal axes."""
     line, = ax.plot(poses[:, 0], poses[:, 1], label=label or role, **ROLES[role] | look)
     known = np.isfinite(poses[:, 0])
-    start = poses[known][:1]
-    ax.plot(start[:, 0], start[:, 1], "o", color=line.get_color(), markersize=4)
+    x, y = poses[known][0, :2]
+    ax.plot(x, y, "o", color=line.get_color(), markersize=4)
     ax.set_aspect("equal", adjustable="datalim")
     ax.set(xlabel="x (m)", ylabel="y (m)")
     return ax
@@ -233,9 +231,8 @@ def longest_semi_axes(covariances: np.ndarray) -> np.ndarray:
 
 def enlargement(poses: np.ndarray, covariances: np.ndarray) -> int:
     """The factor of one digit with which the largest 95 % ellipse has MAX_SEMI_AXIS, at least 1."""
-    known = np.isfinite(poses[:, 0])
-    extent = np.ptp(poses[known, :2], axis=0).max()
-    largest = longest_semi_axes(covariances[known]).max()
+    extent = np.ptp(poses[:, :2], axis=0).max()
+    largest = longest_semi_axes(covariances).max()
     factor = MAX_SEMI_AXIS * extent / largest
     return max(1, int(float(f"{factor:.0e}")))
 
@@ -251,8 +248,8 @@ def legend_below(fig: Figure) -> None:
     """Draw one legend below all axes of a figure: each label once."""
     entries = {label: handle for ax in fig.axes
                for handle, label in zip(*ax.get_legend_handles_labels())}
-    columns = int(fig.get_figwidth() / 1.8)                  # inches, of a label
-    fig.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=columns)
+    fig.legend(entries.values(), entries.keys(), loc="outside lower center",
+               ncols=int(fig.get_figwidth() / 1.8))          # inches, of a label
 
 
 def curve(ax: Axes, values: np.ndarray, role: str, frame: np.ndarray, label: str | None = None,

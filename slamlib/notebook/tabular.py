@@ -150,9 +150,8 @@ def calibration_rows(result, drive) -> Iterator[dict]:
             yield row | {"used": "estimate" if entry["released"] else "both"}
     if has_ranges and not drive.dataset.vehicle.range_noise_factor:
         factor = result.noise.ranges
-        sigma = factor * result.noise_sigma[2]
         yield {"dataset": drive.name, "entry": "`range_noise_factor`",
-               "estimated": estimate(factor, sigma), "used": "estimate"}
+               "estimated": estimate(factor, factor * result.noise_sigma[2]), "used": "estimate"}
 
 
 def antenna_rows(result, drive) -> Iterator[dict]:
@@ -169,7 +168,7 @@ def antenna_rows(result, drive) -> Iterator[dict]:
     distance = 1e3 * np.linalg.norm(error, axis=1)
     squared = se2.squared_norms(error, result.antenna_covariance)
     sigmas = evaluation.sigmas(result.antenna_covariance)
-    for k, antenna in enumerate(ids.tolist()):
+    for k, antenna in enumerate(ids):
         name = f"{antenna}"
         if antenna in result.doubts:
             name += "?"

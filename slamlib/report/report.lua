@@ -19,7 +19,6 @@ local function refuse(reason)
   io.stderr:write("refused: ", options.here, ".ipynb: ", reason, "\n")
   os.exit(1)
 end
-
 local function raw(text) return pandoc.RawBlock(FORMAT, text) end
 local function as_it_is(element) return element, false end
 
@@ -27,7 +26,6 @@ local function as_it_is(element) return element, false end
 local function label(chapter, id)
   return typst and ((chapter .. "." .. id):gsub("[^%w%-_.]", "-")) or id
 end
-
 local function address(chapter, id)
   local file = not typst and chapter ~= options.here and options.files[chapter] or ""
   return file .. (id == "" and not typst and "" or "#" .. label(chapter, id))
@@ -52,7 +50,6 @@ local function picture(image)
   return pandoc.RawInline("typst", ("#picture(%s, %s)"):format(
     pandoc.json.encode(name), pandoc.json.encode(stringify(image.caption))))
 end
-
 local function is_picture(block)
   return block.tag == "Para" and #block.content == 1
     and (block.content[1].tag == "Image" or block.content[1].tag == "RawInline")
@@ -108,8 +105,11 @@ local function formula(math)
     return {pandoc.RawInline("typst", ("#display(%s)["):format(tag and '"(' .. tag .. ')"' or "none")),
       math, pandoc.RawInline("typst", tag and ("]<%s>"):format(attr.identifier) or "]")}
   end
-  local number = tag and pandoc.Span("(" .. tag .. ")", {class = "number"})
-  return pandoc.Span({pandoc.Span({math}, {class = "keep"}), number}, attr)
+  local number, parts = tag and pandoc.Span("(" .. tag .. ")", {class = "number"}), pandoc.Inlines{}
+  for part in (math.text .. "\\qquad"):gmatch "(.-)\\qquad" do -- which may stand on lines of their own
+    parts:insert(pandoc.Span({pandoc.Math(math.mathtype, part)}, {class = "keep"}))
+  end
+  return pandoc.Span({pandoc.Span(parts, {class = "parts"}), number}, attr)
 end
 
 -- Text that pandoc writes into a cell of Typst as a numbered list.
@@ -158,7 +158,6 @@ local function answer(quote)
   local box = stringify(quote.content[1]) == "Answer" and pandoc.Div(quote.content, {class = "answer"})
   return box and typst and {raw "#answer[", box, raw "]"} or box or nil
 end
-
 local function outside_of_formula(str)
   if str.text:find "^\\begin{" then refuse("a formula stands outside of $$: " .. str.text) end
 end
@@ -209,6 +208,7 @@ local function resolved(link)
     link.target = address(name, id)
     return link
   end
+  if id and stringify(link):find "^%(" then return {} end -- a remark on what is not in the report
   return (id or typst and not link.target:find "^%a+:") and link.content or link
 end
 

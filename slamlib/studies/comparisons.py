@@ -104,8 +104,7 @@ def mean_by_information(places, covariances):
     return certain + np.linalg.solve(information.sum(axis=0), weighted)
 
 
-def map_of_problem_2(measurements: Measurements, in_world: np.ndarray,
-                     covariances: np.ndarray) -> np.ndarray:
+def map_of_problem_2(measurements, in_world, covariances):
     """(k, 3) markers of problem 2's map, by consensus where it has none.
 
     Parameters as of `consensus_markers`.
@@ -180,7 +179,6 @@ def guesses(seed: int, error: float, **options) -> dict:
     distance, nees = antenna_error(found, truth)
     right = distance < MAX_ANTENNA_ERROR
     in_doubt = np.isin(found.antenna, list(found.doubts))
-    silently_wrong = ~right & ~in_doubt & (nees > POINT_GATE)
     return {"right": right.mean(), "in doubt": in_doubt.mean(),
-            "silently wrong": silently_wrong.mean(),
+            "silently wrong": np.mean(~right & ~in_doubt & (nees > POINT_GATE)),
             "from the guess": np.mean(guess_error < MAX_ANTENNA_ERROR)}

@@ -23,7 +23,6 @@ from slamlib.core import odometry, se2
 from slamlib.core.evaluation import anees, ate, position_sigmas
 from slamlib.core.increments import TYPICAL_SLIP
 from slamlib.core.records import Dataset, Truth
-from slamlib.core.sightings import sightings_by_frame
 from slamlib.robust.fit import refine
 from slamlib.robust.result import SlamResult, slam_result
 from slamlib.robust.solution_doubts import solution_doubts
@@ -53,7 +52,7 @@ def problem2_trial(seed: int, **options) -> dict:
         "hint": fuse_increments(dataset),
         "exact hint": fuse_increments(dataset, odometry.first_order),
         "fused": fuse(dataset)}
-    frame = sightings_by_frame(aruco).frame
+    frame = methods["ArUco"].frame
     numbers = {}
     for name, found in methods.items():
         rows = slice(None) if len(found.poses) == len(frame) else frame

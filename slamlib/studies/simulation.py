@@ -262,8 +262,9 @@ def _place_markers(layout, poses, rng):
 
 def _place_antennas(count, poses, rng):
     """Ids (a,) and positions (a, 2) of antennas on an ellipse around the driven area."""
-    low = poses[:, :2].min(axis=0)
-    high = poses[:, :2].max(axis=0)
+    path = poses[:, :2]
+    low = path.min(axis=0)
+    high = path.max(axis=0)
     sector = np.arange(count) + rng.uniform(-0.2, 0.2, count)
     angle = 2 * np.pi * sector / count + np.pi / 4
     half_axes = 0.6 * (high - low) + 1.0
