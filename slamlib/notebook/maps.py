@@ -13,7 +13,7 @@ HALF_WIDTH, WIDTH = 4.08, 7.4      # inches: half the width of the page, and all
 FLAT = 0.55                        # height of a map over its width, below which it needs all of it
 ABOVE_AND_BELOW = 0.8              # inches, for title, label and legend
 # Places of a name relative to its landmark, in font sizes, in the order in which they are tried.
-NAME_OFFSETS = (1, 0.9), (-1, 0.9), (1, -0.9), (-1, -0.9), (0, 1.4), (0, -1.4)
+NAME_OFFSETS = (1, 0.9), (-1, 0.9), (1, -0.9), (-1, -0.9), (0, 1.4), (0, -1.4), (1.6, 0), (-1.6, 0)
 MOST_NAMES = 60                    # number of markers, beyond which the map names antennas only
 HALO = withStroke(linewidth=1.5, foreground="white")       # so that a name on the path can be read
 
@@ -35,7 +35,8 @@ def whole_map(drive, result) -> Figure:
     plotting.with_ellipses(ax, result.poses, result.covariances, role, "vehicle", enlarged,
                            count=24)
     if truth is not None:
-        plotting.trajectory(ax, truth.poses, "truth", linewidth=0.7)
+        plotting.trajectory(ax, truth.poses, "truth", linewidth=3.5, linestyle="-", alpha=0.25,
+                            zorder=2)                        # below the path, which covers it
     if len(result.marker):
         plotting.ellipses(ax, result.marker_in_world, result.marker_covariance,
                           plotting.ROLES["aruco"]["color"], enlarged=enlarged)
@@ -53,6 +54,8 @@ def whole_map(drive, result) -> Figure:
     plotting.legend_below(fig)
     fig.draw_without_rendering()                                  # fixes the axes for the names
     taken = []
+    signs = ax.transData.transform(np.concatenate([
+        result.poses[:, :2], result.marker_in_world[:, :2], result.antenna_in_world]))
     ranged = (drive.dataset.uwb or NO_RANGES).antenna
     seen = result.sightings.marker[~result.rejected]
     for kind, letter, size, doubtful, measured in (
@@ -66,7 +69,7 @@ def whole_map(drive, result) -> Figure:
             if each in doubtful:
                 name += "?"
             if letter or each in doubtful or len(ids) <= MOST_NAMES:
-                _write_name(ax, place, name, size, taken)
+                _write_name(ax, place, name, size, taken, signs)
             count = np.count_nonzero(measured == each)
             # Pages tell the name of this invisible disc: report.lua makes a title of it.
             ax.plot(*place, "o", alpha=0, markersize=9, zorder=9,
@@ -84,18 +87,23 @@ def _size(result):
     return width, width * shape + ABOVE_AND_BELOW
 
 
-def _write_name(ax, place, name, size, taken):
+def _write_name(ax, place, name, size, taken, signs):
     """Write a name beside its place (2,) in m, where it covers none of the boxes `taken`.
 
-    Its own box joins them. Without a free place within the axes there is no name.
+    Of these places it takes one that covers the fewest of the `signs` (n, 2), in pixels. Its own
+    box joins the others. Without a free place within the axes there is no name.
     """
-    for offset in NAME_OFFSETS:
-        text = ax.annotate(name, place, size * np.array(offset), textcoords="offset points",
-                           ha="center", va="center", fontsize=size, zorder=7, in_layout=False,
-                           path_effects=[HALO])
+    text = ax.annotate(name, place, (0, 0), textcoords="offset points", ha="center", va="center",
+                       fontsize=size, zorder=7, in_layout=False, path_effects=[HALO])
+    fewest = np.inf
+    for offset in size * np.array(NAME_OFFSETS):
+        text.set_position(offset)
         box = text.get_window_extent()
-        is_inside = ax.bbox.contains(*box.min) and ax.bbox.contains(*box.max)
-        if is_inside and not box.count_overlaps(taken):
-            taken.append(box)
-            return
+        is_free = not box.count_overlaps(taken) and ax.bbox.count_contains(box.corners()) == 4
+        if is_free and box.count_contains(signs) < fewest:
+            fewest, best, own = box.count_contains(signs), offset, box
+    if fewest == np.inf:
         text.remove()
+        return
+    text.set_position(best)
+    taken.append(own)
