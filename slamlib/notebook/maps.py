@@ -27,7 +27,9 @@ def whole_map(drive, result) -> Figure:
     confirms. Names of antennas begin with A. Names of more than MOST_NAMES markers, and those
     without a free place, are left out; pages tell them under the pointer.
     """
-    fig, ax = plt.subplots(figsize=_size(result))
+    shown = np.concatenate([
+        result.poses[:, :2], result.marker_in_world[:, :2], result.antenna_in_world])
+    fig, ax = plt.subplots(figsize=_size(shown))
     ax.set_title(drive.name)
     truth = drive.truth
     role = "slam_uwb" if len(result.antenna) else "slam"
@@ -54,8 +56,7 @@ def whole_map(drive, result) -> Figure:
     plotting.legend_below(fig)
     fig.draw_without_rendering()                                  # fixes the axes for the names
     taken = []
-    signs = ax.transData.transform(np.concatenate([
-        result.poses[:, :2], result.marker_in_world[:, :2], result.antenna_in_world]))
+    signs = ax.transData.transform(shown)
     ranged = (drive.dataset.uwb or NO_RANGES).antenna
     seen = result.sightings.marker[~result.rejected]
     for kind, letter, size, doubtful, measured in (
@@ -77,10 +78,8 @@ def whole_map(drive, result) -> Figure:
     return fig
 
 
-def _size(result):
-    """Width and height in inches of a map of a SlamResult that leaves little white beside it."""
-    places = np.concatenate([result.poses[:, :2], result.marker_in_world[:, :2],
-                             result.antenna_in_world])
+def _size(places):
+    """Width and height in inches of a map of places (n, 2) that leaves little white beside it."""
     across, up = np.ptp(places, axis=0)
     shape = np.clip(up / max(across, 1e-9), 0.25, 1.0)
     width = WIDTH if shape < FLAT else HALF_WIDTH
@@ -95,15 +94,15 @@ def _write_name(ax, place, name, size, taken, signs):
     """
     text = ax.annotate(name, place, (0, 0), textcoords="offset points", ha="center", va="center",
                        fontsize=size, zorder=7, in_layout=False, path_effects=[HALO])
-    fewest = np.inf
+    free = []
     for offset in size * np.array(NAME_OFFSETS):
         text.set_position(offset)
         box = text.get_window_extent()
-        is_free = not box.count_overlaps(taken) and ax.bbox.count_contains(box.corners()) == 4
-        if is_free and box.count_contains(signs) < fewest:
-            fewest, best, own = box.count_contains(signs), offset, box
-    if fewest == np.inf:
+        if ax.bbox.count_contains(box.corners()) == 4 and not box.count_overlaps(taken):
+            free.append((offset, box))
+    if not free:
         text.remove()
         return
+    best, own = min(free, key=lambda each: each[1].count_contains(signs))
     text.set_position(best)
     taken.append(own)
