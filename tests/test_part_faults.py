@@ -91,6 +91,8 @@ def test_a_delay_that_stays_is_no_change(seed):
     assert later_delay(clean) is None
     assert later_delay(aruco(clean, pose=late)) is None
     assert later_delay(with_moved_camera(clean, 900)) is None
+    lost = counts(slice(600, 900), lambda ticks: 0 * ticks)(clean)
+    assert later_delay(lost) is None
 
 
 def test_counts_of_a_patch_on_which_wheels_slip_are_not_used():

@@ -57,6 +57,7 @@ BUMP_SIGMA = 0.2          # m and rad, of a camera about its stated place, befor
 DELAY_SIGMA = 10.0        # encoder steps, of a delay before and after
 MIN_DELAY_GAIN = 6.0      # of squared residuals, by a change of the delay beside the camera's,
 MIN_GAIN_RATIO = 1.2      # to which that of the camera alone is compared
+MAX_DELAY_COST = 0.85     # of the squared residuals, each up to a limit, without this change
 REWEIGHTED = 4            # times, by the residuals
 MIN_WHEELS_GAIN = 25.0    # of squared residuals, by other wheels in a stretch
 STRETCH_LENGTHS = 30      # number of lengths that are tried
@@ -320,6 +321,8 @@ def later_delay(dataset: Dataset) -> LaterDelay | None:
     near = np.unique(poses[max(k - 2 * OVERLAP, 0):k + 2 * OVERLAP])
     delays = {steps - 1, steps, steps + 1} - {0}
     found = min((LaterDelay(int(pose), each) for pose in near for each in delays), key=cost)
+    if cost(found) > MAX_DELAY_COST * cost(LaterDelay(last, 0)):
+        return None
     log.info("sightings: from pose %d on %d steps later", found.pose + 1, found.steps)
     return found
 
