@@ -18,10 +18,10 @@ pytestmark = pytest.mark.usefixtures("look")
 LABELS = ("truth", "odometry and markers", "SLAM", "hint", "fused")
 
 
-def drawn(count, rows, columns=2, labels=LABELS):
+def drawn(count, rows, columns):
     for _, axes in plotting.each_drive("abc"[:count], rows, 4.0, columns=columns):
         for ax in np.atleast_1d(axes):
-            for label in labels:
+            for label in LABELS:
                 plotting.curve(ax, np.arange(9.0), "slam", np.arange(9), label)
     return plt.gcf()
 
@@ -38,6 +38,7 @@ def test_panels_are_side_by_side_under_their_titles_and_within_the_figure(count,
     fig = drawn(count, rows, columns)
     titles = [title for name in "abc"[:count] for title in [name] + (rows - 1) * [""]]
     assert [ax.get_title("left") for ax in fig.axes] == titles
+    assert [text.get_text() for text in fig.legends[0].get_texts()] == list(LABELS)
     *wide, legend = boxes(fig)
     if count > 1:
         assert wide[rows].x0 > wide[0].x1
@@ -45,16 +46,6 @@ def test_panels_are_side_by_side_under_their_titles_and_within_the_figure(count,
         assert -0.01 <= box.x0 and box.x1 <= fig.get_figwidth() + 0.01
         assert -0.01 <= box.y0 and box.y1 <= fig.get_figheight() + 0.01
     assert legend.y1 < min(box.y0 for box in wide) + 0.01
-
-
-@pytest.mark.parametrize("labels", ["abcd", [*(3 * c for c in "abc"), "d" * 60]])
-def test_a_legend_has_each_label_once_and_fits(labels):
-    fig = drawn(2, 2, labels=labels)
-    fig.set_size_inches(3.9, 9.0)
-    fig.legends.clear()
-    plotting.legend_below(fig)
-    assert len(fig.legends) == 1
-    assert [text.get_text() for text in fig.legends[0].get_texts()] == list(labels)
 
 
 def require_contours(patches, means, covariances, k):
@@ -106,22 +97,8 @@ def test_without_truth_the_bands_of_errors_stand_alone(truth, rows):
         assert ax.collections[0].get_paths()[0].vertices[:, 1].max() == pytest.approx(reach)
 
 
-def units(axis):
-    """What the labels of ticks end in."""
-    plt.gcf().draw_without_rendering()
-    return {label.get_text().split()[-1] for label in axis.get_ticklabels()}
-
-
-def test_ticks_have_the_unit_of_their_size():
-    result, drive = drive_with()
-    for larger, position in ((1, "mm"), (1e6, "m")):
-        result.covariances = larger * result.covariances
-        (_, axes), = plotting.each_drive([drive], rows=2)
-        plotting.errors(axes, result, drive, label="SLAM:")
-        assert axes[0].lines[0].get_label() == "SLAM: error"
-        assert position in units(axes[0].yaxis) <= {position, "m"}
+def test_a_needle_becomes_an_ellipse_on_axes_of_its_own():
     ax = plotting.own_axes(plt.figure().subplots(), np.diag([0.01, 1])**2, np.array([[0.02, 3]]))
-    assert units(ax.xaxis) == {"m"} and "mm" in units(ax.yaxis)
     assert np.abs(ax.lines[0].get_xydata()) == pytest.approx(np.array([[3, 0.02]]))
     assert ax.collections[0].get_paths()[0].vertices.max(axis=0) == pytest.approx(
         [REACH_95, 0.01 * REACH_95])
