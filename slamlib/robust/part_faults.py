@@ -302,21 +302,25 @@ def later_delay(dataset: Dataset) -> LaterDelay | None:
         taken = np.clip(poses - steps, 0, last)
         return se2.between(path[taken[:, 0]], path[taken[:, 1]])
 
-    by_step = se2.difference(increments_late_by(1), increments_late_by(-1)) / 2
-    by_camera = _by_camera(wheels)
-    by_delay = DELAY_SIGMA / BUMP_SIGMA * by_step[:, :2, None]
-    _, _, least = _change(markers[0], wheels, sigma, by_camera)
-    k, change, gain = _change(
-        markers[0], wheels, sigma, np.concatenate([by_camera, by_delay], axis=2))
+    def by_camera_and_delay(late):
+        """Derivatives (n, 2, 4) of positions where markers are seen `late`, in steps."""
+        by_step = se2.difference(increments_late_by(late + 1), increments_late_by(late - 1)) / 2
+        by_delay = DELAY_SIGMA / BUMP_SIGMA * by_step[:, :2, None]
+        return np.concatenate([_by_camera(increments_late_by(late)), by_delay], axis=2)
+
+    k, change, gain = _change(markers[0], wheels, sigma, by_camera_and_delay(0))
+    _, _, least = _change(markers[0], wheels, sigma, _by_camera(wheels))
     steps = round(DELAY_SIGMA / BUMP_SIGMA * change[3])
     if gain < MIN_GAIN_RATIO * least + MIN_DELAY_GAIN or steps == 0:
         return None
 
     def cost(delay):
-        """Squared residuals, up to a limit, if it is mended."""
-        by_wheels = increments_late_by(np.where(poses >= delay.pose, delay.steps, 0))
-        squared = np.sum((markers[0] - by_wheels)[:, :2]**2, axis=1) / sigma[:, 0]**2
-        return np.minimum(squared, GATE).sum()
+        """Squared residuals, each up to a limit, if it is mended and nothing else changes."""
+        late = np.where(poses >= delay.pose, delay.steps, 0)
+        by_wheels = increments_late_by(late)
+        e = se2.difference(markers[0], by_wheels)[:, :2, None]
+        J = np.concatenate([by_camera_and_delay(late), by_wheels[:, :2, None]], axis=2)
+        return np.minimum(_squared_residuals(e, J, sigma[:, 0]**2 / 2), GATE).sum()
 
     near = np.unique(poses[max(k - 2 * OVERLAP, 0):k + 2 * OVERLAP])
     delays = {steps - 1, steps, steps + 1} - {0}
@@ -367,6 +371,20 @@ def _change(markers, wheels, sigma, by_change):
         squared = np.sum((left - by_change @ changed)**2, axis=(1, 2)) / variance
         weight = _robust_weights(squared, _scale(squared, 2)) / variance
     return k + 1, (after[k] - before[k])[:, 0], gain[k] / OVERLAP
+
+
+def _squared_residuals(e, J, variance):
+    """Squared residuals (n,) of errors e (n, 2, 1) but for what all have in common by J (n, 2, q).
+
+    They are in units of the `variance` (n,).
+    """
+    weight = 1 / variance
+    for _ in range(REWEIGHTED):
+        weighted = weight[:, None, None] * J.mT
+        common, _ = _least_squares(np.sum(weighted @ J, axis=0), np.sum(weighted @ e, axis=0))
+        squared = np.sum((e - J @ common)**2, axis=(1, 2)) / variance
+        weight = _robust_weights(squared, _scale(squared, 2)) / variance
+    return squared
 
 
 def _scale(squared, size):
