@@ -254,7 +254,8 @@ def camera_bump(dataset: Dataset) -> CameraBump | None:
     markers, wheels, sigma, poses = moving_increments(dataset, signs=(1,))
     if len(wheels) <= 2 * MIN_COUNT:
         return None
-    k, motion, gain = _change(markers[0], wheels, sigma, _by_camera(wheels))
+    k, before, after, gain = _change(markers[0], wheels, sigma, _by_camera(wheels))
+    motion = after - before
     if gain < MIN_BUMP_GAIN or np.abs(motion).max() > MAX_BUMP:
         return None
     s = sightings_by_frame(dataset.sightings)
@@ -308,15 +309,16 @@ def later_delay(dataset: Dataset) -> LaterDelay | None:
         by_delay = DELAY_SIGMA / BUMP_SIGMA * by_step[:, :2, None]
         return np.concatenate([_by_camera(increments_late_by(late)), by_delay], axis=2)
 
-    k, change, gain = _change(markers[0], wheels, sigma, by_camera_and_delay(0))
-    _, _, least = _change(markers[0], wheels, sigma, _by_camera(wheels))
-    steps = round(DELAY_SIGMA / BUMP_SIGMA * change[3])
+    k, before, after, gain = _change(markers[0], wheels, sigma, by_camera_and_delay(0))
+    *_, least = _change(markers[0], wheels, sigma, _by_camera(wheels))
+    first = round(DELAY_SIGMA / BUMP_SIGMA * before[3])
+    steps = round(DELAY_SIGMA / BUMP_SIGMA * after[3]) - first
     if gain < MIN_GAIN_RATIO * least + MIN_DELAY_GAIN or steps == 0:
         return None
 
     def cost(delay):
         """Squared residuals, each up to a limit, if it is mended and nothing else changes."""
-        late = np.where(poses >= delay.pose, delay.steps, 0)
+        late = first + np.where(poses >= delay.pose, delay.steps, 0)
         by_wheels = increments_late_by(late)
         e = se2.difference(markers[0], by_wheels)[:, :2, None]
         J = np.concatenate([by_camera_and_delay(late), by_wheels[:, :2, None]], axis=2)
@@ -346,7 +348,7 @@ def _by_camera(wheels):
 
 
 def _change(markers, wheels, sigma, by_change):
-    """Number of the first increment after a change, the change (q,), and the gain.
+    """Number of the first increment after a change, what is (q,) before and after it, and the gain.
 
     By increments (n, 3) of markers and wheels, sigmas (n, 2) of distance and turn by markers, and
     derivatives (n, 2, q) of positions by what changes. Wheels may be off by one factor all the
@@ -370,7 +372,7 @@ def _change(markers, wheels, sigma, by_change):
         changed = np.where((np.arange(len(e)) <= k)[:, None, None], before[k], after[k])
         squared = np.sum((left - by_change @ changed)**2, axis=(1, 2)) / variance
         weight = _robust_weights(squared, _scale(squared, 2)) / variance
-    return k + 1, (after[k] - before[k])[:, 0], gain[k] / OVERLAP
+    return k + 1, before[k, :, 0], after[k, :, 0], gain[k] / OVERLAP
 
 
 def _squared_residuals(e, J, variance):
