@@ -35,6 +35,14 @@ from slamlib.studies import montecarlo
 from slamlib.studies.simulation import TABLE_2
 
 
+def test_sightings_that_are_late_as_stated_are_at_the_poses_of_their_time():
+    clean, _ = short(3, 600)
+    clean = replace(clean, aruco=clean.aruco.select(clean.aruco.pose < 590))
+    late = aruco(vehicle(sighting_lag=4.0)(clean), pose=clean.aruco.pose + 4)
+    assert_allclose(fuse(late).poses, fuse(clean).poses, atol=1e-9)
+    assert_array_equal(localize(late.sightings).frame, localize(clean.sightings).frame)
+
+
 def test_perfect_data_give_the_exact_poses_map_and_wheels():
     dataset, truth = short(1, 1000, noise=False)
     for each in (fuse(dataset, slip=1e-3), fuse(dataset)):

@@ -4,7 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numeric import aligned_ate, aruco, counts, mean_nees, seen_from, short, without_headings
+from numeric import (
+    aligned_ate,
+    aruco,
+    counts,
+    mean_nees,
+    seen_from,
+    short,
+    vehicle,
+    without_headings,
+)
 from numpy.testing import assert_allclose, assert_array_equal
 
 from slamlib import estimate, fuse
@@ -82,6 +91,17 @@ def test_a_delay_that_changes_is_told_and_costs_problems_2_and_3_nothing(pose, s
     assert not solution_doubts(found)
     for solution, alone in ((found, estimate(clean)), (fuse(spoilt), fuse(clean))):
         assert aligned_ate(solution, truth) < 1.5 * aligned_ate(alone, truth) + 5e-3
+
+
+@pytest.mark.parametrize("stated", [0.0, 5.0])
+def test_a_delay_that_changes_is_found_beside_one_before_and_a_camera_elsewhere(stated):
+    dataset = with_moved_camera(short(24)[0], 0)
+    readings = dataset.aruco
+    late = readings.pose + np.where(readings.pose >= 1000, 1, 6)
+    late = np.minimum(late, len(dataset.ticks) - 1)
+    spoilt = aruco(vehicle(sighting_lag=stated)(dataset), pose=late)
+    delay = later_delay(spoilt)
+    assert delay.steps == -5 and abs(delay.pose - 1000) < 50
 
 
 @pytest.mark.parametrize("seed", [41, 42, 43])

@@ -70,16 +70,26 @@ class Dataset:
     notes: tuple[str, ...] = ()      # what was mended or left out while reading, a sentence each
 
     @property
-    def sightings(self) -> ArucoReadings | None:
-        """The ArucoReadings in the vehicle, by the stated camera and size; None without markers."""
+    def sightings_in_time(self) -> ArucoReadings | None:
+        """The ArucoReadings at the poses at which, by the stated lag, they were taken, or None."""
         if self.aruco is None:
+            return None
+        taken = self.aruco.pose - round(self.vehicle.sighting_lag)
+        is_known = (0 <= taken) & (taken < len(self.ticks))
+        return replace(self.aruco, pose=taken).select(is_known)
+
+    @property
+    def sightings(self) -> ArucoReadings | None:
+        """Those in time, in the vehicle, by the stated camera and size; None without markers."""
+        in_time = self.sightings_in_time
+        if in_time is None:
             return None
         stated = self.vehicle
         scale = np.array([stated.marker_size, stated.marker_size, 1])
-        marker_in_camera = scale * self.aruco.marker_in_vehicle
-        covariance = scale[:, None] * self.aruco.covariance * scale
+        marker_in_camera = scale * in_time.marker_in_vehicle
+        covariance = scale[:, None] * in_time.covariance * scale
         return replace(
-            self.aruco,
+            in_time,
             marker_in_vehicle=se2.compose(stated.camera, marker_in_camera),
             covariance=se2.rotate_covariance(covariance, stated.camera_turn))
 

@@ -249,9 +249,9 @@ def _stretches(dataset):
 
 
 def _sightings(dataset):
-    """Sightings of a Dataset, pose 0 among their frames, by the stated size and noise."""
+    """Sightings of a Dataset, pose 0 among their frames, by the stated lag, size and noise."""
     vehicle = dataset.vehicle
-    s = sightings_by_frame(dataset.aruco, extra_frames=[0])
+    s = sightings_by_frame(dataset.sightings_in_time, extra_frames=[0])
     length = vehicle.marker_size
     scale = np.array([length, length, 1.0])
     sigma_scale = scale * (vehicle.marker_noise_factor or 1.0)

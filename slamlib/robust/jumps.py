@@ -213,7 +213,7 @@ def find_jumps(dataset: Dataset) -> Jumps:
     path = odometry.dead_reckoning(dataset.ticks, vehicle, model="arc")
     drives = {}
     for lag in LAGS:
-        taken = s.frame - round(vehicle.sighting_lag) - lag
+        taken = s.frame - lag
         poses = path[np.clip(taken, 0, len(path) - 1)]
         drives[lag] = _Drive.without_jumps(poses, vehicle.wheelbase)
     lag = _chosen_lag(s, drives)

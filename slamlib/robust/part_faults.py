@@ -55,9 +55,8 @@ MIN_BUMP_GAIN = 35.0      # of squared residuals, by a camera that was moved
 MAX_BUMP = 0.3            # m and rad, of a motion of the camera
 BUMP_SIGMA = 0.2          # m and rad, of a camera about its stated place, before and after
 DELAY_SIGMA = 10.0        # encoder steps, of a delay before and after
-MIN_DELAY_GAIN = 6.0      # of squared residuals, by a change of the delay beside the camera's,
-MIN_GAIN_RATIO = 1.2      # to which that of the camera alone is compared
-MAX_DELAY_COST = 0.85     # of the squared residuals, each up to a limit, without this change
+MIN_DELAY_GAIN = 6.0      # of squared residuals, by a change of the delay beside the camera's
+MAX_DELAY_COST = 0.83     # of the squared residuals, each up to a limit, without this change
 REWEIGHTED = 4            # times, by the residuals
 MIN_WHEELS_GAIN = 25.0    # of squared residuals, by other wheels in a stretch
 STRETCH_LENGTHS = 30      # number of lengths that are tried
@@ -271,7 +270,8 @@ def camera_bump(dataset: Dataset) -> CameraBump | None:
     off = se2.between(steps[usable], found.increment[usable])
     covariance = found.covariance[usable]
     gains = se2.squared_norms(off, covariance) - se2.squared_norms(off - motion, covariance)
-    bump = CameraBump(int(s.frame[1 + usable[gains.argmax()]]), motion)
+    taken = int(s.frame[1 + usable[gains.argmax()]])
+    bump = CameraBump(taken + round(dataset.vehicle.sighting_lag), motion)
     log.info("camera: moved before pose %d, by %s", bump.pose + 1, np.round(motion, 3))
     return bump
 
@@ -310,10 +310,9 @@ def later_delay(dataset: Dataset) -> LaterDelay | None:
         return np.concatenate([_by_camera(increments_late_by(late)), by_delay], axis=2)
 
     k, before, after, gain = _change(markers[0], wheels, sigma, by_camera_and_delay(0))
-    *_, least = _change(markers[0], wheels, sigma, _by_camera(wheels))
     first = round(DELAY_SIGMA / BUMP_SIGMA * before[3])
     steps = round(DELAY_SIGMA / BUMP_SIGMA * after[3]) - first
-    if gain < MIN_GAIN_RATIO * least + MIN_DELAY_GAIN or steps == 0:
+    if gain < MIN_DELAY_GAIN or steps == 0:
         return None
 
     def cost(delay):
@@ -329,6 +328,7 @@ def later_delay(dataset: Dataset) -> LaterDelay | None:
     found = min((LaterDelay(int(pose), each) for pose in near for each in delays), key=cost)
     if cost(found) > MAX_DELAY_COST * cost(LaterDelay(last, 0)):
         return None
+    found = found._replace(pose=found.pose + round(dataset.vehicle.sighting_lag))
     log.info("sightings: from pose %d on %d steps later", found.pose + 1, found.steps)
     return found
 
