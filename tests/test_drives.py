@@ -1,5 +1,7 @@
 """Problems solved in a chapter: results are written, and what fails or is doubted is said."""
 
+import logging
+
 import numpy as np
 import pytest
 from conftest import contradicted
@@ -105,3 +107,9 @@ def test_where_no_drive_has_the_sensor_it_is_said(data, monkeypatch):
     monkeypatch.setenv("SLAMLIB_DATASETS", "wheels")
     with pytest.raises(DatasetError, match="expected a dataset with UWB ranges, found none"):
         start("uwb")
+
+
+def test_what_slamlib_warns_of_is_said_of_the_drive(said, good):
+    with attempt(good):
+        logging.getLogger("slamlib.core.graph_solution").warning("no step lowers the error")
+    assert said == ["**good**: no step lowers the error"]

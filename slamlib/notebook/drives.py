@@ -4,6 +4,7 @@ What fails or is doubted stands in a sentence in the chapter, and in the drive's
 from which the report's first page has it.
 """
 
+import logging
 import os
 import re
 from collections.abc import Iterable, Iterator
@@ -101,8 +102,13 @@ def write_results(drive: Drive, problem: str, found) -> None:
 def attempt(drive: Drive, problem: str | None = None) -> Iterator[None]:
     """Say in a sentence why a block fails on a Drive, and go on behind it.
 
-    Where the block solves a problem, a key of `solve.PROBLEMS`, its failure is in the results, too.
+    What slamlib warns of in the block is said, too. Where the block solves a problem, a key of
+    `solve.PROBLEMS`, its failure is in the results.
     """
+    warnings = logging.Handler(logging.WARNING)
+    warnings.emit = lambda record: _say(drive, record.getMessage())
+    log = logging.getLogger("slamlib")
+    log.addHandler(warnings)
     try:
         yield
     except solve.UNSOLVABLE as error:
@@ -110,6 +116,8 @@ def attempt(drive: Drive, problem: str | None = None) -> Iterator[None]:
             _say(drive, f"left out here: {error}.")
         else:
             write_results(drive, problem, error)
+    finally:
+        log.removeHandler(warnings)
 
 
 def show_doubts(drive: Drive, doubts: Iterable[solve.Doubt]) -> None:
