@@ -43,6 +43,14 @@ def test_sightings_that_are_late_as_stated_are_at_the_poses_of_their_time():
     assert_array_equal(localize(late.sightings).frame, localize(clean.sightings).frame)
 
 
+def test_a_delay_that_nobody_stated_costs_the_fusion_nothing():
+    clean, truth = short(3)
+    clean = replace(clean, aruco=clean.aruco.select(clean.aruco.pose < 1990))
+    late = aruco(clean, pose=clean.aruco.pose + 5)
+    assert_allclose(fuse(late).poses, fuse(clean).poses, atol=1e-9)
+    assert ate(fuse(late).poses, truth.poses, aligned=True) < 0.02
+
+
 def test_perfect_data_give_the_exact_poses_map_and_wheels():
     dataset, truth = short(1, 1000, noise=False)
     for each in (fuse(dataset, slip=1e-3), fuse(dataset)):

@@ -21,7 +21,7 @@ one with the greatest likelihood ratio, and its counts are not used.
 
 import logging
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -55,6 +55,7 @@ MIN_BUMP_GAIN = 35.0      # of squared residuals, by a camera that was moved
 MAX_BUMP = 0.3            # m and rad, of a motion of the camera
 BUMP_SIGMA = 0.2          # m and rad, of a camera about its stated place, before and after
 DELAY_SIGMA = 10.0        # encoder steps, of a delay before and after
+DELAYS = range(-12, 13)   # encoder steps, of a delay of the whole drive
 MIN_DELAY_GAIN = 6.0      # of squared residuals, by a change of the delay beside the camera's
 MAX_DELAY_COST = 0.83     # of the squared residuals, each up to a limit, without this change
 REWEIGHTED = 4            # times, by the residuals
@@ -296,12 +297,7 @@ def later_delay(dataset: Dataset) -> LaterDelay | None:
     markers, wheels, sigma, poses = moving_increments(dataset, signs=(1,))
     if len(wheels) <= 2 * MIN_COUNT:
         return None
-    path = odometry.dead_reckoning(dataset.ticks, dataset.vehicle, model="arc")
-    last = len(path) - 1
-
-    def increments_late_by(steps):
-        taken = np.clip(poses - steps, 0, last)
-        return se2.between(path[taken[:, 0]], path[taken[:, 1]])
+    increments_late_by = partial(_late_increments, dataset, poses)
 
     def by_camera_and_delay(late):
         """Derivatives (n, 2, 4) of positions where markers are seen `late`, in steps."""
@@ -318,19 +314,49 @@ def later_delay(dataset: Dataset) -> LaterDelay | None:
     def cost(delay):
         """Squared residuals, each up to a limit, if it is mended and nothing else changes."""
         late = first + np.where(poses >= delay.pose, delay.steps, 0)
-        by_wheels = increments_late_by(late)
-        e = se2.difference(markers[0], by_wheels)[:, :2, None]
-        J = np.concatenate([by_camera_and_delay(late), by_wheels[:, :2, None]], axis=2)
-        return np.minimum(_squared_residuals(e, J, sigma[:, 0]**2 / 2), GATE).sum()
+        return _cost(markers[0], increments_late_by(late), sigma, by_camera_and_delay(late))
 
     near = np.unique(poses[max(k - 2 * OVERLAP, 0):k + 2 * OVERLAP])
     delays = {steps - 1, steps, steps + 1} - {0}
     found = min((LaterDelay(int(pose), each) for pose in near for each in delays), key=cost)
-    if cost(found) > MAX_DELAY_COST * cost(LaterDelay(last, 0)):
+    if cost(found) > MAX_DELAY_COST * cost(found._replace(steps=0)):
         return None
     found = found._replace(pose=found.pose + round(dataset.vehicle.sighting_lag))
     log.info("sightings: from pose %d on %d steps later", found.pose + 1, found.steps)
     return found
+
+
+def constant_delay(dataset: Dataset) -> int:
+    """Encoder steps by which all sightings are later than stated, 0 if it is not decidedly so."""
+    markers, wheels, sigma, poses = moving_increments(dataset, signs=(1,))
+    if len(wheels) <= 2 * MIN_COUNT:
+        return 0
+    cost = {}
+    for steps in DELAYS:
+        late = _late_increments(dataset, poses, steps)
+        cost[steps] = _cost(markers[0], late, sigma, _by_camera(late))
+    best = min(cost, key=cost.get)
+    if cost[best] > MAX_DELAY_COST * cost[0]:
+        return 0
+    log.info("sightings: %d steps later than stated", best)
+    return best
+
+
+def _late_increments(dataset, poses, steps):
+    """Increments (n, 3) by wheels between these encoder poses (n, 2) less `steps`, up to (n, 2)."""
+    path = odometry.dead_reckoning(dataset.ticks, dataset.vehicle, model="arc")
+    taken = np.clip(poses - steps, 0, len(path) - 1)
+    return se2.between(path[taken[:, 0]], path[taken[:, 1]])
+
+
+def _cost(markers, wheels, sigma, by_change):
+    """Squared residuals, each up to a limit, of positions of increments (n, 3) by both.
+
+    But for one factor on those by wheels, and what all have in common by_change (n, 2, q).
+    """
+    e = se2.difference(markers, wheels)[:, :2, None]
+    J = np.concatenate([by_change, wheels[:, :2, None]], axis=2)
+    return np.minimum(_squared_residuals(e, J, sigma[:, 0]**2 / 2), GATE).sum()
 
 
 def mended(dataset: Dataset) -> Dataset:
