@@ -56,7 +56,7 @@ MAX_BUMP = 0.3            # m and rad, of a motion of the camera
 BUMP_SIGMA = 0.2          # m and rad, of a camera about its stated place, before and after
 DELAY_SIGMA = 10.0        # encoder steps, of a delay before and after
 DELAYS = range(-12, 13)   # encoder steps, of a delay of the whole drive
-MIN_DELAY_GAIN = 6.0      # of squared residuals, by a change of the delay beside the camera's
+MIN_DELAY_GAIN = 6.0      # of squared residuals, by a change of the delay and of the camera
 MAX_DELAY_COST = 0.83     # of the squared residuals, each up to a limit, without this change
 REWEIGHTED = 4            # times, by the residuals
 MIN_WHEELS_GAIN = 25.0    # of squared residuals, by other wheels in a stretch
@@ -295,7 +295,7 @@ class LaterDelay(NamedTuple):
 def later_delay(dataset: Dataset) -> LaterDelay | None:
     """The LaterDelay of a Dataset, or None if the camera's place explains the sightings as well."""
     markers, wheels, sigma, poses = moving_increments(dataset, signs=(1,))
-    if len(wheels) <= 2 * MIN_COUNT:
+    if not _agree_mostly(markers[0], wheels, sigma):
         return None
     increments_late_by = partial(_late_increments, dataset, poses)
 
@@ -329,7 +329,7 @@ def later_delay(dataset: Dataset) -> LaterDelay | None:
 def constant_delay(dataset: Dataset) -> int:
     """Encoder steps by which all sightings are later than stated, 0 if it is not decidedly so."""
     markers, wheels, sigma, poses = moving_increments(dataset, signs=(1,))
-    if len(wheels) <= 2 * MIN_COUNT:
+    if not _agree_mostly(markers[0], wheels, sigma):
         return 0
     cost = {}
     for steps in DELAYS:
@@ -340,6 +340,12 @@ def constant_delay(dataset: Dataset) -> int:
         return 0
     log.info("sightings: %d steps later than stated", best)
     return best
+
+
+def _agree_mostly(markers, wheels, sigma):
+    """Whether there are enough increments by both, of which most agree; delays cost them little."""
+    agree = contradictions(markers, wheels, sigma) < 1
+    return len(agree) > 2 * MIN_COUNT and 2 * agree.sum() > len(agree)
 
 
 def _late_increments(dataset, poses, steps):
