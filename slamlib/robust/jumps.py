@@ -298,7 +298,7 @@ def _without_bad_frames(drive, found):
     kept = []
     for jump in sorted(found, key=attrgetter("step")):
         kept.append(jump)
-        for k in reversed(range(len(kept))):
+        for k in reversed(range(len(kept) - 1)):
             if jump.step - kept[k].step > MAX_BAD_FRAMES:
                 break
             if _cancel(drive, kept[k:]):

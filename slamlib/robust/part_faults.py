@@ -297,7 +297,8 @@ def later_delay(dataset: Dataset) -> LaterDelay | None:
     markers, wheels, sigma, poses = moving_increments(dataset, signs=(1,))
     if not _agree_mostly(markers[0], wheels, sigma):
         return None
-    increments_late_by = partial(_late_increments, dataset, poses)
+    path = odometry.dead_reckoning(dataset.ticks, dataset.vehicle, model="arc")
+    increments_late_by = partial(_late_increments, path, poses)
 
     def by_camera_and_delay(late):
         """Derivatives (n, 2, 4) of positions where markers are seen `late`, in steps."""
@@ -331,9 +332,10 @@ def constant_delay(dataset: Dataset) -> int:
     markers, wheels, sigma, poses = moving_increments(dataset, signs=(1,))
     if not _agree_mostly(markers[0], wheels, sigma):
         return 0
+    path = odometry.dead_reckoning(dataset.ticks, dataset.vehicle, model="arc")
     cost = {}
     for steps in DELAYS:
-        late = _late_increments(dataset, poses, steps)
+        late = _late_increments(path, poses, steps)
         cost[steps] = _cost(markers[0], late, sigma, _by_camera(late))
     best = min(cost, key=cost.get)
     if cost[best] > MAX_DELAY_COST * cost[0]:
@@ -348,9 +350,11 @@ def _agree_mostly(markers, wheels, sigma):
     return len(agree) > 2 * MIN_COUNT and 2 * agree.sum() > len(agree)
 
 
-def _late_increments(dataset, poses, steps):
-    """Increments (n, 3) by wheels between these encoder poses (n, 2) less `steps`, up to (n, 2)."""
-    path = odometry.dead_reckoning(dataset.ticks, dataset.vehicle, model="arc")
+def _late_increments(path, poses, steps):
+    """Increments (n, 3) by wheels, of encoder poses (n, 2) that are too large by `steps`.
+
+    `path` is that of all poses by wheels, `steps` a number or (n, 2).
+    """
     taken = np.clip(poses - steps, 0, len(path) - 1)
     return se2.between(path[taken[:, 0]], path[taken[:, 1]])
 
@@ -362,7 +366,8 @@ def _cost(markers, wheels, sigma, by_change):
     """
     e = se2.difference(markers, wheels)[:, :2, None]
     J = np.concatenate([by_change, wheels[:, :2, None]], axis=2)
-    return np.minimum(_squared_residuals(e, J, sigma[:, 0]**2 / 2), GATE).sum()
+    _, squared = _in_common(e, J, sigma[:, :1]**2 / 2)
+    return np.minimum(squared, GATE).sum()
 
 
 def mended(dataset: Dataset) -> Dataset:
@@ -407,18 +412,20 @@ def _change(markers, wheels, sigma, by_change):
     return k + 1, before[k, :, 0], after[k, :, 0], gain[k] / OVERLAP
 
 
-def _squared_residuals(e, J, variance):
-    """Squared residuals (n,) of errors e (n, 2, 1) but for what all have in common by J (n, 2, q).
+def _in_common(e, J, variance, sigma=BUMP_SIGMA):
+    """What errors e (n, d, 1) have in common by J (n, d, q), (q, 1), and squared residuals (n,).
 
-    They are in units of the `variance` (n,).
+    By robust least squares about 0 with a prior sigma. The residuals are in units of the variances
+    (n, d) or (n, 1).
     """
-    weight = 1 / variance
+    weighted = (J / variance[:, :, None]).mT
+    kept = np.ones(len(e))
     for _ in range(REWEIGHTED):
-        weighted = weight[:, None, None] * J.mT
-        common, _ = _least_squares(np.sum(weighted @ J, axis=0), np.sum(weighted @ e, axis=0))
-        squared = np.sum((e - J @ common)**2, axis=(1, 2)) / variance
-        weight = _robust_weights(squared, _scale(squared, 2)) / variance
-    return squared
+        robust = kept[:, None, None] * weighted
+        common, _ = _least_squares(np.sum(robust @ J, axis=0), np.sum(robust @ e, axis=0), sigma)
+        squared = np.sum((e - J @ common)[:, :, 0]**2 / variance, axis=1)
+        kept = _robust_weights(squared, _scale(squared, e.shape[1]))
+    return common, squared
 
 
 def _scale(squared, size):
@@ -466,21 +473,14 @@ def _other_radii(e, J, variance):
     derivatives J (n, 3, 2) by relative changes of both radii, which may be off all the time.
     """
     e = e[:, :, None]
-    weighted = (J / variance[:, :, None]).mT
-    kept = np.ones(len(e))
-    for _ in range(REWEIGHTED):
-        robust = kept[:, None, None] * weighted
-        common, _ = _least_squares(
-            np.sum(robust @ J, axis=0), np.sum(robust @ e, axis=0), WHEELS_SIGMA)
-        left = e - J @ common
-        squared = np.sum(left[:, :, 0]**2 / variance, axis=1)
-        scale = _scale(squared, 3)
-        kept = _robust_weights(squared, scale)
+    common, squared = _in_common(e, J, variance, WHEELS_SIGMA)
+    scale = _scale(squared, 3)
     if scale > MAX_SCALE:
         return None
-    robust = kept[:, None, None] * weighted
+    kept = _robust_weights(squared, scale)
+    robust = kept[:, None, None] * (J / variance[:, :, None]).mT
     information = odometry.cumulative(robust @ J)
-    right = odometry.cumulative(robust @ left)
+    right = odometry.cumulative(robust @ (e - J @ common))
     found = None
     least = MIN_WHEELS_GAIN * OVERLAP
     longest = max(MIN_COUNT, int(MAX_WHEELS_STRETCH * len(e)))
