@@ -54,7 +54,7 @@ MAX_STRETCH = 0.5         # of the drive, in which wheels are exchanged; else th
 MIN_BUMP_GAIN = 35.0      # of squared residuals, by a camera that was moved
 MAX_BUMP = 0.3            # m and rad, of a motion of the camera
 BUMP_SIGMA = 0.2          # m and rad, of a camera about its stated place, before and after
-DELAY_SIGMA = 10.0        # encoder steps, of a delay before and after
+DELAY_UNIT = 50.0         # encoder steps; BUMP_SIGMA of them is the sigma of a delay, too
 DELAYS = range(-12, 13)   # encoder steps, of a delay of the whole drive
 MIN_DELAY_GAIN = 6.0      # of squared residuals, by a change of the delay and of the camera
 MAX_DELAY_COST = 0.83     # of the squared residuals, each up to a limit, without this change
@@ -303,12 +303,12 @@ def later_delay(dataset: Dataset) -> LaterDelay | None:
     def by_camera_and_delay(late):
         """Derivatives (n, 2, 4) of positions where markers are seen `late`, in steps."""
         by_step = se2.difference(increments_late_by(late + 1), increments_late_by(late - 1)) / 2
-        by_delay = DELAY_SIGMA / BUMP_SIGMA * by_step[:, :2, None]
+        by_delay = DELAY_UNIT * by_step[:, :2, None]
         return np.concatenate([_by_camera(increments_late_by(late)), by_delay], axis=2)
 
     k, before, after, gain = _change(markers[0], wheels, sigma, by_camera_and_delay(0))
-    first = round(DELAY_SIGMA / BUMP_SIGMA * before[3])
-    steps = round(DELAY_SIGMA / BUMP_SIGMA * after[3]) - first
+    first = round(DELAY_UNIT * before[3])
+    steps = round(DELAY_UNIT * after[3]) - first
     if gain < MIN_DELAY_GAIN or steps == 0:
         return None
 
