@@ -28,7 +28,9 @@ from slamlib.core.evaluation import ate
 from slamlib.core.odometry import dead_reckoning
 from slamlib.core.records import Dataset
 from slamlib.robust import jumps
+from slamlib.robust.factors import odometry_error, preintegrate_odometry
 from slamlib.robust.fused import fuse
+from slamlib.robust.measurements import measure
 from slamlib.robust.solution_doubts import _encoder_doubts, solution_doubts
 from slamlib.studies.simulation import TABLE_2, manoeuvre, simulate
 
@@ -266,6 +268,27 @@ def test_counts_that_creep_while_the_vehicle_stands_say_nothing(count):
     truth = SimpleNamespace(poses=poses)
     assert aligned_ate(found, truth) < 4e-3 and mean_nees(found, truth) < 5
     assert not solution_doubts(found)
+
+
+def test_odometry_tells_no_length_not_even_where_counts_creep_at_a_stand():
+    """Wheels and distances that are longer by one factor leave the errors in counts as they are."""
+    dataset, poses = standing(*short(1), rows=100, count=10, at=600, every=10)
+    measurements = measure(dataset)
+    assert measurements.crawls.any()
+    wheel = dataset.vehicle.wheel
+    poses = poses[measurements.frame]
+
+    def errors(factor, linearised):
+        odometry = replace(preintegrate_odometry(measurements, "arc", linearised * wheel),
+                           in_counts=True)
+        e = odometry_error(odometry, poses * [factor, factor, 1], factor * wheel)[0]
+        return e, odometry.covariance(1e-3)
+
+    e, Q = errors(1.0, linearised=1.0)
+    for linearised in (1.0, 1.1):
+        longer = errors(1.1, linearised)
+        assert_allclose(longer[0], e, atol=1e-12)
+        assert_allclose(longer[1], Q, rtol=1e-9, atol=1e-16)
 
 
 def test_sightings_that_are_noisier_far_away_are_no_jump():

@@ -250,7 +250,7 @@ class _Sets(NamedTuple):
     roots: np.ndarray            # (s, p, p) of the priors, in wide sigmas
     evidence: np.ndarray         # (s,) log evidence
     merit: np.ndarray            # (s,) log evidence less the prices of the groups
-    furthest: np.ndarray         # (s,) largest posterior mean of an unknown, in its sigmas
+    furthest: np.ndarray         # (s,) largest posterior mean of what is released, in its sigmas
 
 
 def _proposal(fit):
@@ -292,8 +292,11 @@ def _sets(calibration, L, h, width):
     sets = [frozenset(some) for count in range(MAX_GROUPS + 1)
             for some in combinations(groups, count)]
     priors = [calibration.prior(some, width) for some in sets]
-    roots = _in_wide_sigmas(calibration, L, np.array([prior.root for prior in priors]))
-    evidence, furthest = _log_evidence(L, h, roots)
+    given = np.array([prior.root for prior in priors])
+    released = np.diagonal(given, axis1=1, axis2=2) > calibration.sigma
+    roots = _in_wide_sigmas(calibration, L, given)
+    evidence, mean = _log_evidence(L, h, roots)
+    furthest = (released * np.abs(mean)).max(axis=1)
     prices = np.array([sum(price[group] for group in some) for some in sets])
     return _Sets(sets, priors, roots, evidence, evidence - prices, furthest)
 
@@ -342,15 +345,15 @@ def _price(calibration, group):
 def _log_evidence(L, h, root):
     """Log evidences (...) of priors with roots (..., p, p), as of a Prior.
 
-    From the information L (p, p) and h (p,) of the likelihood. Also the largest posterior mean of
-    an unknown, (...), in its standard deviations, in which the equations are solved.
+    From the information L (p, p) and h (p,) of the likelihood. Also the posterior means (..., p) of
+    the unknowns, in their standard deviations, in which the equations are solved.
     """
     information = np.eye(len(h)) + root.mT @ L @ root
     gradient = h @ root
     mean = np.linalg.solve(information, gradient[..., None])[..., 0]
     log_determinant = np.linalg.slogdet(information).logabsdet
     evidence = np.sum(gradient * mean, axis=-1) / 2 - log_determinant / 2
-    return evidence, np.abs(mean).max(axis=-1)
+    return evidence, mean
 
 
 def _likelihood(fit):

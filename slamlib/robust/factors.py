@@ -42,18 +42,18 @@ def preintegrate_odometry(measurements: Measurements, model: str,
     """The OdometryIncrements of Measurements, linearised at `wheel` (3,) m, None for that stated.
 
     `model` is "arc" or "euler". Jumps are added where there are some. Where the vehicle crawls the
-    increment is uncertain by itself.
+    increment is uncertain by itself, as the stated wheels have it: to them all noise belongs.
     """
     frame = measurements.frame
     increments = preintegrate(
         measurements.dataset, frame, model, wheel, measurements.odometry_noise)
     jump, jump_covariance = measurements.jumps.added(frame[:-1], frame[1:])
-    moves = ~measurements.crawls
-    creep = creep_covariance(increments.increment, measurements.crawls)
+    off = increments.stated - increments.wheel
+    as_stated = increments.increment + increments.J_wheel @ off
+    creep = creep_covariance(as_stated, measurements.crawls)
     uncertain = jump_covariance + se2.rotate_covariance(creep, -increments.increment[:, 2])
     return replace(
         increments, in_counts=False, increment=se2.compose(increments.increment, jump),
-        J_wheel=moves[:, None, None] * increments.J_wheel,
         rounding=increments.rounding + uncertain)
 
 
