@@ -56,7 +56,7 @@ MAX_BUMP = 0.3            # m and rad, of a motion of the camera
 BUMP_SIGMA = 0.2          # m and rad, of a camera about its stated place, before and after
 DELAY_UNIT = 50.0         # encoder steps; BUMP_SIGMA of them is the sigma of a delay, too
 DELAYS = range(-12, 13)   # encoder steps, of a delay of the whole drive
-MIN_DELAY_GAIN = 6.0      # of squared residuals, by a change of the delay and of the camera
+MIN_DELAY_GAIN = 6.0      # of squared residuals, each up to a limit, by a change of the delay
 MAX_DELAY_COST = 0.83     # of the squared residuals, each up to a limit, without this change
 REWEIGHTED = 4            # times, by the residuals
 MIN_WHEELS_GAIN = 25.0    # of squared residuals, by other wheels in a stretch
@@ -306,10 +306,10 @@ def later_delay(dataset: Dataset) -> LaterDelay | None:
         by_delay = DELAY_UNIT * by_step[:, :2, None]
         return np.concatenate([_by_camera(increments_late_by(late)), by_delay], axis=2)
 
-    k, before, after, gain = _change(markers[0], wheels, sigma, by_camera_and_delay(0))
+    k, before, after, _ = _change(markers[0], wheels, sigma, by_camera_and_delay(0))
     first = round(DELAY_UNIT * before[3])
     steps = round(DELAY_UNIT * after[3]) - first
-    if gain < MIN_DELAY_GAIN or steps == 0:
+    if steps == 0:
         return None
 
     def cost(delay):
@@ -319,8 +319,10 @@ def later_delay(dataset: Dataset) -> LaterDelay | None:
 
     near = np.unique(poses[max(k - 2 * OVERLAP, 0):k + 2 * OVERLAP])
     delays = {steps - 1, steps, steps + 1} - {0}
-    found = min((LaterDelay(int(pose), each) for pose in near for each in delays), key=cost)
-    if cost(found) > MAX_DELAY_COST * cost(found._replace(steps=0)):
+    tried = [LaterDelay(int(pose), each) for pose in near for each in delays]
+    found = min(tried, key=cost)
+    without = cost(found._replace(steps=0))
+    if cost(found) > min(MAX_DELAY_COST * without, without - MIN_DELAY_GAIN * OVERLAP):
         return None
     found = found._replace(pose=found.pose + round(dataset.vehicle.sighting_lag))
     log.info("sightings: from pose %d on %d steps later", found.pose + 1, found.steps)
