@@ -74,7 +74,8 @@ def _calibration_doubts(result):
     Of groups that the drive cannot tell apart, on that which is furthest from what is stated.
     """
     common = frozenset.intersection(*result.explanations)
-    either = frozenset().union(*result.explanations) - common
+    of_any = frozenset().union(*result.explanations)
+    either = [group for group in GROUPS if group in of_any - common]
     table = np.array(result.calibration_table)
     rows = {group: table[result.calibration.of_group(group)] for group in GROUPS}
 
@@ -91,7 +92,7 @@ def _calibration_doubts(result):
         if group == "camera-bump":
             sentence = f"From pose {result.jumps.bump + 1} on the camera is elsewhere. {sentence}"
         if group == furthest:
-            others = [name for other, (name, _) in GROUPS.items() if other in either - {group}]
+            others = [GROUPS[other][0] for other in either if other != group]
             sentence += (f" It may instead be {' or '.join(others)}: the drive cannot tell, and "
                          "the covariances include it.")
         yield Doubt(group, sentence, advice)
