@@ -58,8 +58,6 @@ STATED = 3.0                 # log evidence beside it, if standard deviations ar
 AMBIGUOUS = 3.0              # log evidence within which explanations cannot be told apart
 MAX_GROUPS = 5               # number of groups that are wrong at once
 MAX_WIDE_SIGMAS = 4.0        # wide sigmas, of an entry; beyond them a statement is grossly wrong
-MAX_UNTOLD = 1.5             # wide sigmas; an entry further off is not released untold,
-MAX_UNTOLD_SIGMA = 0.5       # wide sigmas; unless its standard deviation is below this
 GROSS = 10.0                 # factor on the wide sigmas beyond MAX_WIDE_SIGMAS
 MIN_INFORMATION = 1e-3       # about an entry, in wide sigmas, below which it is not considered
 MAX_PROPOSALS = 5            # number of sets that are solved
@@ -259,8 +257,8 @@ def _proposal(fit):
     `explanations` are the best set of groups and others that come within AMBIGUOUS of it, neither
     part of it nor more: the drive cannot tell them apart. Each of their groups must raise the log
     evidence by its `_price`. The prior releases all groups of the sets that come so close, and what
-    else raises the evidence and is plausible: not certain enough to be told, but the covariances
-    include it. Wide standard deviations are multiplied by GROSS if an entry would be further off
+    else raises the evidence: not certain enough to be told, but the covariances include it. Wide
+    standard deviations are multiplied by GROSS if an entry that is released would be further off
     than MAX_WIDE_SIGMAS.
     """
     calibration = fit.problem.measurements.calibration
@@ -274,7 +272,7 @@ def _proposal(fit):
     close = np.flatnonzero(sets.merit > sets.merit[k] - AMBIGUOUS)
     told = [sets.groups[each] for each in close]
     explanations = tuple(some for some in told if not (some < best or some > best))
-    k = _released_set(calibration, L, h, sets, certain=frozenset().union(*told), default=k)
+    k = _released_set(calibration, sets, certain=frozenset().union(*told), default=k)
     present = _log_evidence(L, h, _in_wide_sigmas(calibration, L, fit.problem.prior.root))[0]
     return _Proposal(explanations, sets.priors[k], sets.evidence[k] - present)
 
@@ -306,31 +304,17 @@ def _in_wide_sigmas(calibration, L, roots):
     return (np.diag(L) > 0)[:, None] / calibration.wide[:, None] * roots
 
 
-def _released_set(calibration, L, h, sets, certain, default):
-    """Number of the most probable of the _Sets that holds `certain`, and else what is plausible.
+def _released_set(calibration, sets, certain, default):
+    """Number of the most probable of the _Sets that hold `certain`, the `default` if there is none.
 
-    Fully stated groups are less probable by STATED each. It is the `default` if there is none.
+    Fully stated groups are less probable by STATED each.
     """
     stated = {group: calibration.sigma[calibration.of_group(group)].all()
               for group in frozenset().union(*sets.groups)}
     surprise = STATED * np.array([sum(stated[group] for group in some) for some in sets.groups])
-    for k in np.argsort(surprise - sets.evidence):
-        untold = [calibration.of_group(group) for group in sets.groups[k] - certain]
-        if certain <= sets.groups[k] and _are_plausible(L, h, sets.roots[k], untold):
-            return k
-    return default
-
-
-def _are_plausible(L, h, root, groups):
-    """Whether all entries of groups, masks (p,), are near what is stated or told by the drive.
-
-    By the likelihood of L (p, p) and h (p,) and a prior with this root (p, p).
-    """
-    information = np.eye(len(L)) + root.T @ L @ root
-    covariance = root @ np.linalg.solve(information, root.T)
-    is_near = np.abs(covariance @ h) < MAX_UNTOLD
-    is_told = np.diag(covariance) < MAX_UNTOLD_SIGMA**2
-    return all((is_near | is_told)[entries].all() for entries in groups)
+    holding = [k for k, some in enumerate(sets.groups) if certain <= some]
+    probable = sets.evidence - surprise
+    return max(holding, key=probable.item, default=default)
 
 
 def _price(calibration, group):

@@ -26,7 +26,7 @@ from slamlib.core import odometry, se2
 from slamlib.core.marker_increments import distance_and_turn, robust_increments
 from slamlib.core.records import Dataset
 from slamlib.core.sightings import GATE, MEDIAN_CHI2, sightings_by_frame
-from slamlib.robust.part_faults import slipping_rows
+from slamlib.robust.part_faults import constant_delay, slipping_rows
 
 log = logging.getLogger(__name__)
 
@@ -35,13 +35,10 @@ MIN_FROZEN = 20              # ratio of the lengths of runs of equal counts, fro
 # Noise of odometry, generous
 SLIP = 0.03                  # sqrt(m), of a wheel after one metre
 FLOOR = 3e-3                 # m and rad, of an increment
-LAGS = range(-12, 13, 2)     # poses, by which all sightings may be late
 LEVER = 0.12                 # m, by which the camera may be elsewhere than stated
 # Decisions; gains are of twice the log likelihood
 SUSPECT = 7.8                # 95 % quantile of chi-squared with three degrees of freedom
 MIN_GAIN = 12.0              # by a jump
-MIN_LAG_GAIN = 50.0          # by a lag
-MAX_LAG_COST = 0.8           # of that without it; with slip a wrong lag costs 0.95
 PAIRS = 2                    # of sightings of each marker that tell of a jump: one may be wrong
 NEAREST = 24                 # number of these pairs, by the frames between them
 MAX_VARIANCE = 1.0           # m^2, of the place after a jump
@@ -211,14 +208,13 @@ def find_jumps(dataset: Dataset) -> Jumps:
     s = replace(s, row=s.row[order], marker=s.marker[order], z=s.z[order], C=s.C[order])
     vehicle = dataset.vehicle
     path = odometry.dead_reckoning(dataset.ticks, vehicle, model="arc")
-    drives = {}
-    for lag in LAGS:
-        taken = s.frame - lag
-        poses = path[np.clip(taken, 0, len(path) - 1)]
-        drives[lag] = _Drive.without_jumps(poses, vehicle.wheelbase)
-    lag = _chosen_lag(s, drives)
     slipping = slipping_rows(dataset) | frozen_rows(dataset.ticks)
-    candidates = [_found(dataset.ticks, s, drives[each], slipping) for each in sorted({0, lag})]
+    lag = constant_delay(dataset)
+    candidates = []
+    for each in sorted({0, lag}):
+        poses = path[np.clip(s.frame - each, 0, len(path) - 1)]
+        drive = _Drive.without_jumps(poses, vehicle.wheelbase)
+        candidates.append(_found(dataset.ticks, s, drive, slipping))
     found = min(candidates, key=len)
     jumps = replace(NO_JUMPS, lag=lag)
     for jump in found:
@@ -241,20 +237,6 @@ def _chance(ticks, slipping):
     counts = np.abs(ticks).max(axis=1)
     spike = counts > SPIKE * np.quantile(counts, 0.99)
     return np.cumsum(np.where(spike | slipping, SPIKE_CHANCE, 1.0))
-
-
-def _chosen_lag(s, drives):
-    """The lag whose _Drive agrees best with the sightings, if decidedly better than that of 0."""
-    cost = {}
-    for lag, drive in drives.items():
-        pairs = _compared(s, drive)
-        cost[lag] = _cost(pairs.squared).sum()
-    best = min(cost, key=cost.get)
-    if cost[best] >= min(cost[0] - MIN_LAG_GAIN, MAX_LAG_COST * cost[0]):
-        return 0
-    log.info("sightings seem %d poses later than stated: cost %.1f, as stated %.1f",
-             best, cost[best], cost[0])
-    return best
 
 
 def _cost(squared):

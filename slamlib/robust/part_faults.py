@@ -332,7 +332,7 @@ def later_delay(dataset: Dataset) -> LaterDelay | None:
 def constant_delay(dataset: Dataset) -> int:
     """Encoder steps by which all sightings are later than stated, 0 if it is not decidedly so."""
     markers, wheels, sigma, poses = moving_increments(dataset, signs=(1,))
-    if not _agree_mostly(markers[0], wheels, sigma):
+    if not len(wheels):
         return 0
     path = odometry.dead_reckoning(dataset.ticks, dataset.vehicle, model="arc")
     cost = {}
@@ -340,7 +340,8 @@ def constant_delay(dataset: Dataset) -> int:
         late = _late_increments(path, poses, steps)
         cost[steps] = _cost(markers[0], late, sigma, _by_camera(late))
     best = min(cost, key=cost.get)
-    if cost[best] > MAX_DELAY_COST * cost[0]:
+    late = _late_increments(path, poses, best)
+    if cost[best] > MAX_DELAY_COST * cost[0] or not _agree_mostly(markers[0], late, sigma):
         return 0
     log.info("sightings: %d steps later than stated", best)
     return best
