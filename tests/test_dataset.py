@@ -105,8 +105,8 @@ def test_truth_in_another_frame_is_moved_to_its_first_pose_with_a_note(folder):
     for name in ("poses", "marker_in_world", "antenna_in_world"):
         assert_allclose(getattr(found, name), getattr(clean, name), atol=1e-12)
     assert found.notes == (
-        "In truth: vehiclePose.txt begins at (12.500 m, -3.250 m, 2.8000 rad): poses and maps were "
-        "moved into the frame of its first pose, in which the estimates are.",)
+        "In truth: vehiclePose.txt: it begins at (12.500 m, -3.250 m, 2.8000 rad), so poses and "
+        "maps were moved into the frame of its first pose, in which the estimates are.",)
 
 
 @pytest.mark.parametrize("start", ["9e-4 -9e-4 9e-4", "0 0 6.283185307", "0 0 -12.566"])
@@ -138,8 +138,8 @@ def test_absent_or_empty_sensors_are_none_and_of_the_empty_ones_it_is_said(folde
             write(folder / name, content)
     data = read_dataset(folder)
     assert (data.aruco, data.uwb, data.antenna_guess) == (None, None, None)
-    told = () if content is None else names
-    assert data.notes == tuple(f"{name} has no rows of numbers." for name in told)
+    told = () if content is None else (f"{', '.join(names)}: no rows of numbers.",)
+    assert data.notes == told
 
 
 def test_absent_maps_are_empty_and_the_true_vehicle_that_of_the_drive(folder):

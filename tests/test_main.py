@@ -131,7 +131,7 @@ def test_notes_and_doubts_are_said_and_in_the_summary(tmp_path, drive, capsys):
     told = capsys.readouterr()
     last = told.out.splitlines()[-1]
     assert last == f"drive: doubt (antenna): {doubt['sentence']} {doubt['advice']}"
-    assert "ArucoReading.txt.txt was read as ArucoReading.txt." in summary["notes"]
+    assert "Read ArucoReading.txt.txt as ArucoReading.txt." in summary["notes"]
     for note in summary["notes"]:
         assert f"drive: note: {note}\n" in told.err
 
