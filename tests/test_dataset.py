@@ -150,11 +150,6 @@ def test_absent_maps_are_empty_and_the_true_vehicle_that_of_the_drive(folder):
     assert len(truth.marker) == len(truth.antenna) == 0 and truth.vehicle == VEHICLE
 
 
-def test_absent_truth_is_none(folder):
-    (folder / "truth").rename(folder / "true")
-    assert read_truth(folder) is None
-
-
 def test_the_first_poses_have_the_readings_until_then(folder):
     data = read_dataset(folder)
     assert data.first(3).uwb.pose.tolist() == [0] and len(data.first(3).aruco.pose) == 3
@@ -218,12 +213,6 @@ def test_a_missing_file_that_must_be_there_is_named(folder, read, name):
     assert error_of(read, folder) == f"{folder / name}: expected this file, found none."
 
 
-@pytest.mark.parametrize("name", ["nowhere", "vehicle.toml"])
-@pytest.mark.parametrize("read", [read_dataset, read_truth])
-def test_what_is_no_folder_is_named(folder, name, read):
-    assert error_of(read, folder / name) == f"{folder / name}: expected a folder that can be read"
-
-
 @pytest.mark.parametrize("target", ["nothing", "/dev/zero", "pipe"])
 @pytest.mark.parametrize("name", ["ArucoReading.txt", "vehicle.toml"])
 def test_files_that_cannot_be_read_are_refused_and_not_waited_for(folder, name, target):
@@ -251,9 +240,8 @@ def write_counts(folder, ticks):
 
 
 @pytest.mark.parametrize("first, second, wrong", [
-    (0, 0, 0), (0, 132, 132), (132, -132, 132), (31_999, 31_999, 31_999), (132, 132, 3000),
-    (132, 132, -16_000), (132, 132, 31_999), (132, 132, 40_000), (132, 132, 62_000),
-    (132, 132, 70_000)])
+    (0, 132, 132), (132, -132, 132), (31_999, 31_999, 31_999), (132, 132, -16_000),
+    (132, 132, 62_000), (132, 132, 70_000)])
 def test_increments_of_any_drive_are_taken_as_such(first, second, wrong, tmp_path):
     """Fifty of one kind, fifty of another, and one in between that may be wrong."""
     ticks = np.repeat([[0, 0], [first, first], [wrong, 90], [second, second]], [1, 50, 1, 50], 0)

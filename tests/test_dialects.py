@@ -330,13 +330,6 @@ def test_arrays_are_the_dataset_of_their_files(folder):
     assert dataset_from_arrays(ARRAYS["ticks"]).aruco is None
 
 
-def test_gaps_in_arrays_are_left_out_with_a_note():
-    found = dataset_from_arrays(**ARRAYS | {"uwb": [*ARRAYS["uwb"], [1, 3, 0, 1]]})
-    assert found.notes == (
-        "uwb: 1 of 3 rows left out, the first in row 3: expected no gap (an empty cell, NaN or the "
-        "range 0), found '1 3 0 1'.",)
-
-
 @pytest.mark.parametrize("name, value, told", [
     ("ticks", [[0], [1]], ": expected a matrix of numbers with 2 columns (right ticks, left ticks),"
      " found 'shape (2, 1)'"), ("ticks", [], ": expected at least"),
@@ -435,15 +428,10 @@ def test_datasets_are_the_folders_with_any_file_of_one_and_all_others_are_named(
     assert "with a sub-folder with an enc" in error_of(datasets_in, tmp_path / "a")
 
 
-def test_what_was_found_is_said(folder):
-    assert inventory_lines(read_dataset(folder), read_truth(folder)) == [
-        "drive: 4 poses, 3 sightings, 2 ranges, truth known"]
-
-
 def test_what_was_not_found_is_said(folder):
     for name in ("ArucoReading.txt", "vehicle.toml"):
         (folder / name).unlink()
     write(folder / "UwbReading.txt", "# none\n")
-    assert inventory_lines(read_dataset(folder), None) == [
-        "drive: 4 poses, 0 sightings, 0 ranges, truth unknown",
+    assert inventory_lines(read_dataset(folder), read_truth(folder)) == [
+        "drive: 4 poses, 0 sightings, 0 ranges, truth known",
         "drive: note: UwbReading.txt: no rows of numbers."]
