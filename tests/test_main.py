@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import contradicted, file_names
-from numeric import short
+from numeric import short, vehicle
 
 from slamlib import estimate, solve
 from slamlib.__main__ import main
@@ -49,13 +49,13 @@ def test_solve_says_what_it_reads_and_prints_a_table(tmp_path, monkeypatch, caps
     assert "ate_m" in header and row.split()[:3] == ["drive", "problem1", "2000"]
 
 
-def test_options_of_solve_are_heeded_and_said(folder, capsys):
+def test_options_of_solve_are_heeded_and_said(tmp_path, drive, capsys):
     """Problem 4 alone with a stated slip and another kernel, beside odometry."""
-    (folder / "drive" / "vehicle.toml").write_text('kernel = "Huber"\nslip = 0.002\n')
-    out = folder / "out"
-    summary = solved(folder, "--problem", 4, "--problem", 1)
+    write_dataset(tmp_path / "drive", vehicle(kernel="Huber", slip=2e-3)(drive[0]))
+    out = tmp_path / "out"
+    summary = solved(tmp_path, "--problem", 4, "--problem", 1)
     assert [*summary["problems"]] == ["problem1", "problem4"]
-    expected = estimate(read_dataset(folder / "drive"), slip=2e-3, kernel="Huber")
+    expected = estimate(read_dataset(tmp_path / "drive"), slip=2e-3, kernel="Huber")
     np.testing.assert_array_equal(read_structs(out / "problem4", "vehiclePose")[1], expected.poses)
     table, told = capsys.readouterr()
     assert told.splitlines()[-1] == f"results: {out}"
