@@ -267,7 +267,7 @@ def test_options_are_those_of_the_vehicle_and_decide_where_both_are_given(name, 
 @pytest.mark.parametrize("options, told", [
     ({"kernel": "huber"}, 'estimate: expected "asymmetric Tukey" or .* for kernel, found .huber'),
     ({"model": "line"}, "estimate: expected euler or arc for model, found 'line'"),
-    ({"slip": np.nan}, "expected a number from 0 to 0.1 sqrt\\(m\\) for slip, found 'nan'"),
+    ({"marker_noise_factor": 0.0}, "expected a number from 0.01 to 100 for marker_noise_factor"),
     ({"gate": "no"}, "expected true or false for gate, found 'no'"),
     ({"dataset": "data/short"}, "estimate: expected a Dataset, found .data/short.")])
 def test_an_option_with_a_wrong_name_or_value_is_told_with_what_there_is(options, told):
