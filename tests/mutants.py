@@ -41,8 +41,6 @@ def places(text):
         lines.update(range(function.body[0].lineno, function.end_lineno + 1))
         for node in ast.walk(function):
             match node:
-                case ast.Expr(value=ast.Call(func=ast.Attribute(value=ast.Name("log" | "LOG")))):
-                    lines.difference_update(range(node.lineno, node.end_lineno + 1))
                 case ast.Assign() | ast.AugAssign() | ast.Expr(value=ast.Call()):
                     end = node.end_lineno, node.end_col_offset
                     yield (node.lineno, node.col_offset), end, "pass"

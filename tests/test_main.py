@@ -91,7 +91,6 @@ def test_results_are_not_written_into_a_dataset(folder, monkeypatch, capsys):
     (["solve", "good", "--out", "out", "--problem", "3"], "expected the measurements of problem3"),
     (["solve", "a/good", "good", "--out", "out"], "datasets in folders of different names"),
     (["report", "medium", "good", "--data", "."], ": expected one of bad, good, found 'medium'"),
-    (["report", "bad", "--data", "."], "bad/encoderReading.txt, line 2: expected "),
 ])
 def test_bad_arguments_give_exit_code_2_and_one_sentence(tmp_path, monkeypatch, capsys, arguments,
                                                          word):
