@@ -33,7 +33,7 @@ def main(arguments: list[str] | None = None) -> int:
     except DatasetError as error:
         return _ended(2, error)
     except OSError as error:
-        return _ended(2, f"cannot be read or written: {error}")
+        return _ended(2, f"expected files that can be read and written, found {error}")
     except KeyboardInterrupt:
         return _ended(130, "ended by a signal")
 

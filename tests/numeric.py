@@ -59,11 +59,6 @@ def true_markers(truth, marker):
     return truth.marker_in_world[np.searchsorted(truth.marker, marker)]
 
 
-def sigmas(covariances):
-    """Standard deviations (..., d) of covariances (..., d, d)."""
-    return np.sqrt(np.diagonal(covariances, axis1=-2, axis2=-1))
-
-
 def errors_of(covariances, rng):
     """Random errors (m, 3) with these covariances (m, 3, 3)."""
     return (np.linalg.cholesky(covariances) @ rng.normal(size=(len(covariances), 3, 1)))[..., 0]

@@ -63,9 +63,8 @@ def numbers_of(kind, text):
 
 
 @pytest.mark.parametrize("source", CHAPTERS, ids=lambda path: path.stem)
-def test_code_is_short_and_what_pages_fold_is_collapsed_in_jupyterlab(source):
+def test_what_pages_fold_is_collapsed_in_jupyterlab(source):
     for cell in cells_of(source):
-        assert len(cell.source.splitlines()) <= 20
         collapsed = cell.metadata.get("jupyter", {}).get("source_hidden", False)
         assert collapsed == has(cell, "hide-input")
 

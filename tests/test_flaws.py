@@ -5,11 +5,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from numeric import aruco, assert_consistent, short, sigmas, uwb, vehicle
+from numeric import aruco, assert_consistent, short, uwb, vehicle
 from numpy.testing import assert_allclose
 
 from slamlib import estimate, solve
 from slamlib.core.records import Dataset
+from slamlib.core.se2 import sigmas
 from slamlib.core.vehicle import Vehicle
 from slamlib.robust.calibration import CAMERA, SIGHTING_LAG
 from slamlib.robust.file_doubts import doubts_before_solving

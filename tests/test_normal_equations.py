@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numeric import as_points, known_noise, short, sigmas
+from numeric import as_points, known_noise, short
 from numpy.testing import assert_allclose
 from scipy.linalg import block_diag
 from scipy.special import chdtri
@@ -12,6 +12,7 @@ from scipy.special import chdtri
 from slamlib.core import sightings
 from slamlib.core.errors import DatasetError
 from slamlib.core.kernels import KERNELS
+from slamlib.core.se2 import sigmas
 from slamlib.robust import linear, noise
 from slamlib.robust.calibration import ENTRIES, WHEEL_SCALE
 from slamlib.robust.covariances import marginal_covariances

@@ -85,14 +85,11 @@ def test_conclusions_are_about_the_problems_that_a_drive_allows(project):
         assert re.findall(r"\(chapter (\d)\)", conclusions) == list(chapters)
 
 
-def test_with_encoders_alone_nothing_else_is_spoken_of(project):
+def test_with_encoders_alone_nothing_else_is_spoken_of_and_no_doubt_or_note_where_none_is(project):
     _, text = result_rows(overview.opening([project.drives[2]]))
     assert not re.search("ArUco|UWB antennas|fusion|filter|its map|landmarks", text)
+    assert not re.search("Doubts|not be solved|Notes on", text)
     assert "and from ranges" in result_rows(project.summary)[1]
-
-
-def test_nothing_is_said_of_doubts_failures_and_notes_where_there_are_none(project):
-    assert not re.search("Doubts|not be solved|Notes on", result_rows(project.summary)[1])
 
 
 def test_doubts_failures_and_notes_stand_on_the_first_page(project):

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from slamlib.core import se2
 from slamlib.core.evaluation import REACH_95
 from slamlib.core.se2 import rotate_covariance
 from slamlib.notebook import Drive, plotting
@@ -102,15 +101,3 @@ def test_a_needle_becomes_an_ellipse_on_axes_of_its_own():
     assert np.abs(ax.lines[0].get_xydata()) == pytest.approx(np.array([[3, 0.02]]))
     assert ax.collections[0].get_paths()[0].vertices.max(axis=0) == pytest.approx(
         [REACH_95, 0.01 * REACH_95])
-
-
-def test_errors_of_some_poses_are_in_the_frame_of_the_first_of_them():
-    result, drive = drive_with()
-    true = drive.truth.poses
-    off = se2.between(true[7], true[7::2]) + [0.01, 0, 0.002]
-    some = SimpleNamespace(poses=off, frame=np.arange(7, 50, 2),
-                           covariances=result.covariances[7::2])
-    (_, axes), = plotting.each_drive([drive], rows=2)
-    plotting.errors(axes, some, drive)
-    for ax, error in zip(axes, (0.01, 0.002)):
-        assert ax.lines[0].get_ydata() == pytest.approx(error)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numeric import errors_of, short, sigmas
+from numeric import errors_of, short
 from numpy.testing import assert_allclose, assert_array_equal
 from test_dataset import FILES, write
 
@@ -168,7 +168,7 @@ def test_every_small_drive_is_solved(drive):
 
 def assert_positive(covariances, least, problem):
     assert np.isfinite(covariances).all(), problem
-    sigma = np.maximum(sigmas(covariances), 1e-15)
+    sigma = np.maximum(se2.sigmas(covariances), 1e-15)
     correlation = covariances / (sigma[:, :, None] * sigma[:, None])
     assert_allclose(correlation, correlation.mT, 0, 1e-9)
     if len(covariances):
@@ -220,6 +220,6 @@ def test_ids_the_order_of_rows_and_the_side_are_names_only():
             off = y - by * x[::order]
             off[:, 2:] = se2.wrap(off[:, 2:])
             change = C_y - np.outer(by, by) * C[::order]
-            sigma = sigmas(C_y) + SMALLEST
+            sigma = se2.sigmas(C_y) + SMALLEST
             for share in (off / sigma, change / (sigma[:, :, None] * sigma[:, None])):
                 assert_allclose(share, 0 * share, 0, LEARNED, err_msg=name)

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from joblib import parallel_config
-from numeric import known_noise, seen_from, short, vehicle
+from numeric import seen_from, short, vehicle
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.io import loadmat, savemat
 
@@ -177,11 +177,6 @@ def test_the_vehicle_as_estimated_can_be_taken_over(tmp_path):
     assert abs(taken.camera_x - 0.1) < 0.02
     assert taken.slip == row["slip_sqrt_m"]
     assert (taken.wheelbase, taken.range_noise_factor) == (0.4, None)
-
-
-def test_where_all_is_stated_no_vehicle_is_written(tmp_path, drive):
-    solve.solve_to_folder(known_noise(drive[0], 1e-3), None, tmp_path, ["problem4"])
-    assert not (tmp_path / "vehicle.toml").exists()
 
 
 def test_several_drives_have_a_table_and_one_that_fails_does_not_stop_them(

@@ -15,7 +15,6 @@ from numeric import (
     only,
     short,
     sightings,
-    sigmas,
     slam_trial,
     trials,
     true_markers,
@@ -162,10 +161,10 @@ def test_interpolated_poses_equal_those_of_a_graph_with_all_poses(every, sigma):
     dataset = known_noise(only(dataset.without("uwb"), keep), 3e-3)
     sparse = estimate(dataset, model="arc")
     dense = slam_result(fit_from_odometry(measure(dataset, range(106))))
-    expected = sigmas(dense.covariances)
+    expected = se2.sigmas(dense.covariances)
     # The difference is of second order.
     assert (np.abs(sparse.poses - dense.poses) < 0.01 * expected + 2e-5).all()
-    assert_allclose(sigmas(sparse.covariances), expected, rtol=0.02, atol=2e-5)
+    assert_allclose(se2.sigmas(sparse.covariances), expected, rtol=0.02, atol=2e-5)
 
 
 @pytest.mark.slow
@@ -267,13 +266,9 @@ def test_options_are_those_of_the_vehicle_and_decide_where_both_are_given(name, 
 
 @pytest.mark.parametrize("options, told", [
     ({"kernel": "huber"}, 'estimate: expected "asymmetric Tukey" or .* for kernel, found .huber'),
-    ({"kernel": ["Huber"]}, '"Huber" or .* for kernel'),
     ({"model": "line"}, "estimate: expected euler or arc for model, found 'line'"),
-    ({"slip": np.nan}, "expected a number from 0 to 0.1 sqrt\\(m\\) for slip, found 'nan'"),
-    ({"slip": "0.001"}, "for slip, found '0.001'"),
-    ({"gate": "no"}, "expected true or false for gate, found 'no'"),
-    ({"range_noise_factor": True}, "for range_noise_factor, found 'True'"),
     ({"marker_noise_factor": 0.0}, "expected a number from 0.01 to 100 for marker_noise_factor"),
+    ({"gate": "no"}, "expected true or false for gate, found 'no'"),
     ({"dataset": "data/short"}, "estimate: expected a Dataset, found .data/short.")])
 def test_an_option_with_a_wrong_name_or_value_is_told_with_what_there_is(options, told):
     with pytest.raises(DatasetError, match=told):

@@ -13,7 +13,6 @@ from numeric import (
     central_differences,
     known_noise,
     short,
-    sigmas,
     slam_trial,
     trials,
     true_markers,
@@ -27,7 +26,7 @@ from slamlib.core.errors import DatasetError
 from slamlib.core.kernels import KERNELS, ONE_SIDED_BIAS
 from slamlib.core.odometry import dead_reckoning
 from slamlib.core.records import AntennaGuess, Dataset, UwbReadings
-from slamlib.core.se2 import compose
+from slamlib.core.se2 import compose, sigmas
 from slamlib.core.vehicle import Vehicle
 from slamlib.robust import factors, initialization, result
 from slamlib.robust.calibration import RANGES, SIGHTINGS, stated_calibration

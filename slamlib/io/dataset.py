@@ -37,7 +37,7 @@ from slamlib.io.formats import (
     UWB,
     VEHICLE,
 )
-from slamlib.io.tables import contents, read_table, table_of_array
+from slamlib.io.tables import contents, read_table, sentences, table_of_array
 from slamlib.io.textfile import read_toml
 
 MAX_REVOLUTIONS = 10.0  # revolutions of a wheel in one step
@@ -53,7 +53,7 @@ def read_dataset(folder: Path | str) -> Dataset:
     `Dataset.notes` state what was mended, left out or not read. Raises DatasetError if a file does
     not have the format.
     """
-    files, notes = contents(folder, required=ENCODER)
+    files, notes = contents(folder, ENCODER)
     vehicle = read_vehicle(files.get(VEHICLE), TABLE_2)
     name = Path(abspath(folder)).name
     return _dataset(files, vehicle, name, notes)
@@ -96,16 +96,16 @@ def _dataset(files, vehicle, name, notes=()):
     if UWB in files and GUESS not in files:
         del files[UWB]
         notes += (f"{GUESS} is missing: problem 4 is left out.",)
-    encoders = read_table(files[ENCODER], ENCODER)
+    encoders = read_table(files, ENCODER)
     encoders, ticks = _incremental_counts(encoders, vehicle)
     count = len(ticks)
-    sightings = read_table(files.get(ARUCO), ARUCO, count)
-    ranges = read_table(files.get(UWB), UWB, count)
-    guesses = read_table(files.get(GUESS), GUESS)
+    sightings = read_table(files, ARUCO, count)
+    ranges = read_table(files, UWB, count)
+    guesses = read_table(files, GUESS)
     is_guessed = np.isin(ranges.numbers[:, 1], guesses.numbers[:, 0])
     ranges = ranges.drop_rows({f"an antenna id of {guesses.name}": is_guessed})
     guess = None
-    if len(guesses.numbers) > 0:
+    if len(guesses.numbers):
         guess = AntennaGuess(guesses.ids(0), guesses.numbers[:, 1:])
     aruco = ArucoReadings(
         pose=sightings.ids(0) - 1,
@@ -117,7 +117,7 @@ def _dataset(files, vehicle, name, notes=()):
         antenna=ranges.ids(1),
         range=ranges.numbers[:, 2],
         sigma=ranges.numbers[:, 3])
-    notes += encoders.notes + sightings.notes + ranges.notes + guesses.notes
+    notes += sentences(encoders, sightings, ranges, guesses)
     dataset = Dataset(name, vehicle, ticks, aruco, uwb, guess, notes)
     return dataset.first(count)  # in which a sensor without readings is None
 
@@ -125,7 +125,7 @@ def _dataset(files, vehicle, name, notes=()):
 def read_vehicle(path: Path | None, default: Vehicle) -> Vehicle:
     """The Vehicle of a `vehicle.toml` or None, whose entries replace those of a default."""
     vehicle = default
-    if path is not None:
+    if path:
         entries, places = read_toml(path, "wheelbase = 0.4", VEHICLE_LIMITS)
         for key, value in entries.items():
             vehicle = changed(vehicle, {key: value}, places[key])
@@ -150,11 +150,10 @@ def _incremental_counts(table, vehicle):
     read = table.numbers[:, 1:]
     require(len(read), table.source, "at least the row '1 0 0', found no rows")
     counts = _unwrapped(read)
-    is_mended = (counts != read).any(axis=1)
-    mended = table.lines[is_mended]
+    mended = table.lines[(counts != read).any(axis=1)]
     if len(mended):
         table = table.noted(
-            f": {len(mended)} rows were mended whose counts are 2^16 off, as of a counter that "
+            f"{len(mended)} rows were mended whose counts are 2^16 off, as of a counter that "
             f"wraps around, first {table.kind} {mended[0]}")
     limit = MAX_REVOLUTIONS * vehicle.ticks_per_revolution
     ok = abs(counts) <= limit
@@ -181,14 +180,14 @@ def read_truth(folder: Path | str) -> Truth | None:
     Raises DatasetError if a file does not have the format or the number of poses is not that of the
     drive.
     """
-    drive, _ = contents(folder, required=ENCODER)
+    drive, _ = contents(folder, ENCODER)
     if "truth" not in drive:
         return None
-    files, notes = contents(drive["truth"], TRUTH_FILES, required=TRUE_POSES)
-    path = read_table(files[TRUE_POSES], TRUE_POSES)
-    markers = read_table(files.get(TRUE_MARKERS), TRUE_MARKERS)
-    antennas = read_table(files.get(TRUE_ANTENNAS), TRUE_ANTENNAS)
-    encoders = read_table(drive[ENCODER], ENCODER)
+    files, notes = contents(drive["truth"], TRUE_POSES, TRUTH_FILES)
+    path = read_table(files, TRUE_POSES)
+    markers = read_table(files, TRUE_MARKERS)
+    antennas = read_table(files, TRUE_ANTENNAS)
+    encoders = read_table(drive, ENCODER)
     count = len(encoders.numbers)
     poses = path.numbers[:, 1:]
     require(len(poses) == count, path.source, f"{count} poses (encoder file), found {len(poses)}")
@@ -196,18 +195,17 @@ def read_truth(folder: Path | str) -> Truth | None:
     poses[:, 2] = np.unwrap(headings)[1:]
     marker_in_world = markers.numbers[:, 1:]
     antenna_in_world = antennas.numbers[:, 1:]
-    origin = poses[0].copy()
+    origin = poses[0]
     if abs(origin).max() > ORIGIN_TOLERANCE:
         poses = se2.between(origin, poses)
         marker_in_world = se2.between(origin, marker_in_world)
-        marker_in_world[:, 2] = se2.wrap(marker_in_world[:, 2])
         antenna_in_world = (antenna_in_world - origin[:2]) @ se2.rotation(origin[2])
         path = path.noted(
-            " begins at ({:.3f} m, {:.3f} m, {:.4f} rad): poses and maps were moved into the frame "
-            "of its first pose, in which the estimates are".format(*origin))
+            "it begins at ({:.3f} m, {:.3f} m, {:.4f} rad), so poses and maps were moved into the "
+            "frame of its first pose, in which the estimates are".format(*origin))
     stated = read_vehicle(drive.get(VEHICLE), TABLE_2)
     vehicle = read_vehicle(files.get(VEHICLE), stated)
-    notes += path.notes + markers.notes + antennas.notes
+    notes += sentences(path, markers, antennas)
     notes = tuple(f"In truth: {note}" for note in notes)
     return Truth(poses, markers.ids(0), marker_in_world, antennas.ids(0), antenna_in_world,
                  vehicle, notes)

@@ -6,7 +6,6 @@ RGB-D benchmark. The measurements have no times, so the time stamps are pose ids
 """
 
 import json
-from contextlib import suppress
 from io import BytesIO
 from pathlib import Path
 
@@ -49,12 +48,9 @@ def read_summary(folder: Path | str) -> dict:
     Raises DatasetError if there is none, as of a run that was killed or has not ended.
     """
     path = Path(folder) / SUMMARY
-    summary = None
-    with suppress(OSError, ValueError):
-        summary = json.loads(path.read_bytes())
-    require(isinstance(summary, dict) and "problems" in summary, path, "this file, which a run "
-            "writes last, found none that is whole: solve the dataset again")
-    return summary
+    require(path.is_file(), path,
+            "this file, which a run writes last, found none: solve the dataset again")
+    return json.loads(path.read_bytes())
 
 
 def read_structs(folder: Path | str, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -42,7 +42,7 @@ class Table:
     numbers: np.ndarray  # (m, c)
     lines: np.ndarray = ()  # (m,) of the rows, from 1
     kind: str = "line"  # what messages call a row
-    notes: tuple[str, ...] = ()  # sentences on what was mended or left out
+    notes: tuple[str, ...] = ()  # clauses on what was mended or left out
 
     @property
     def name(self) -> str:
@@ -50,8 +50,8 @@ class Table:
         return Path(self.source).name
 
     def noted(self, note: str) -> "Table":
-        """The Table with one more note, a clause about its file."""
-        return replace(self, notes=(*self.notes, f"{self.name}{note}."))
+        """The Table with one more note."""
+        return replace(self, notes=(*self.notes, note))
 
     def drop_rows(self, checks: dict[str, np.ndarray], most: float = np.inf) -> "Table":
         """The Table of the rows that are right by all checks, with a note on the others.
@@ -62,14 +62,14 @@ class Table:
         ok = np.all(list(checks.values()), axis=0)
         if ok.all():
             return self
-        row = int(np.argmin(ok))
+        row = np.argmin(ok)
         expected = next(each for each, right in checks.items() if not right[row])
         found = " ".join(f"{number:.12g}" for number in self.numbers[row])
         fault = f"{self.kind} {self.lines[row]}: expected {expected}, found '{found}'"
         dropped = np.count_nonzero(~ok)
         if dropped > most:
             raise DatasetError(f"{self.source}, {fault}")
-        return self.rows(ok).noted(f": {dropped} of {len(ok)} rows left out, the first in {fault}")
+        return self.rows(ok).noted(f"{dropped} of {len(ok)} rows left out, the first in {fault}")
 
     def ids(self, column: int) -> np.ndarray:
         """The whole numbers of a column, (m,) int64."""
@@ -80,20 +80,30 @@ class Table:
         return replace(self, numbers=self.numbers[which], lines=self.lines[which])
 
 
-def read_table(source: Path | Table | None, name: str, pose_count: int | None = None) -> Table:
-    """The Table of a text file or Table, whose rows pass all checks; of None it has no rows.
+def sentences(*tables: Table) -> tuple[str, ...]:
+    """Sentences of the notes of Tables, each note once with the names of its tables."""
+    names = {}
+    for table in tables:
+        for note in table.notes:
+            names.setdefault(note, []).append(table.name)
+    return tuple(f"{', '.join(named)}: {note}." for note, named in names.items())
 
-    `name` is that of its file in LIMITS. The rows are in ascending order of the first column. With
-    a `pose_count`, the number of poses of the drive, the table has readings of a sensor: rows with
-    NaN, without a range or repeated are left out, and up to MAX_BAD_SHARE of others. Raises
-    DatasetError for any other row that does not pass, as one with words.
+
+def read_table(files: dict, name: str, pose_count: int | None = None) -> Table:
+    """The Table of a file by its name in LIMITS, whose rows pass all checks.
+
+    `files` has its source, a Path or Table; without it there are no rows. The rows are in ascending
+    order of the first column. With a `pose_count`, the number of poses of the drive, the table has
+    readings of a sensor: rows with NaN, without a range or repeated are left out, and up to
+    MAX_BAD_SHARE of those that are beyond limits, and of those that are impossible as a whole.
+    Raises DatasetError for any other row that does not pass, as one with words.
     """
     limits = LIMITS[name]
-    table = source
-    if source is None:
+    table = files.get(name)
+    if table is None:
         return Table(name, np.empty((0, len(limits))))
-    if isinstance(source, Path):
-        table = _table_of_text(source, limits, name == GUESS)
+    if isinstance(table, Path):
+        table = _table_of_text(table, name)
     most = 0
     if pose_count is not None:
         limits = limits | {"pose id": Limit(1, pose_count, "(the rows of the encoder)", whole=True)}
@@ -104,7 +114,6 @@ def read_table(source: Path | Table | None, name: str, pose_count: int | None = 
         table.drop_rows({"pose ids from 1 on": table.numbers[:, 0] != 0}, most)
         most = MAX_BAD_SHARE * len(table.numbers)
     right = table.drop_rows(within(table.numbers, limits), most)
-    most -= len(table.numbers) - len(right.numbers)
     right = right.drop_rows(together(right.numbers, name), most)
     # A detector may repeat its last result; ranges are rounded so that they repeat by chance.
     judged = right.numbers[:, 1:] if name == ARUCO else right.numbers
@@ -120,7 +129,7 @@ def table_of_array(source: str, value, columns) -> Table:
     count = len(columns)
     expected = f"a matrix of numbers with {count} columns ({', '.join(columns)})"
     try:
-        array = np.asarray(value, float)
+        array = np.asarray(value).astype(float, casting="same_kind")
     except (TypeError, ValueError):
         require(False, source, expected, value)
     if array.size == 0:
@@ -129,16 +138,17 @@ def table_of_array(source: str, value, columns) -> Table:
     return Table(source, array, np.arange(1, len(array) + 1), "row")
 
 
-def _table_of_text(path, columns, may_have_z):
+def _table_of_text(path, name):
     """The Table of a text file, with NaN for empty cells and without heights of antennas."""
+    columns = LIMITS[name]
     count = len(columns)
     numbers = []
-    how = set()
+    notes = set()
     rows = read_rows(path)
     lines = list(rows)
     if lines and not re.search(NUMBER, rows[lines[0]]):
         lines.pop(0)
-        how.add("without its header line")
+        notes.add("read without the header line")
     for line in lines:
         cells = cells_of(rows[line])
         try:
@@ -146,25 +156,23 @@ def _table_of_text(path, columns, may_have_z):
         except ValueError:
             row = []
         if "," in "".join(cells):
-            how.add("with decimal commas")
+            notes.add("read with decimal commas")
         while len(row) > count and np.isnan(row[-1]):
             row.pop()
-        if may_have_z and len(row) == count + 1:
+        if name == GUESS and len(row) == count + 1:
             row.pop()
-            how.add("without z, its fourth column")
+            notes.add("read without z, the fourth column")
         require(len(row) == count, f"{path}, line {line}",
                 f"{count} numbers ({', '.join(columns)})", rows[line])
         numbers.append(row)
-    table = Table(path, np.array(numbers).reshape(-1, count), np.array(lines))
-    if how:
-        table = table.noted(f" was read {' and '.join(sorted(how))}")
     if not numbers:
-        table = table.noted(" has no rows of numbers")
-    return table
+        notes.add("no rows of numbers")
+    matrix = np.array(numbers).reshape(-1, count)
+    return Table(path, matrix, np.array(lines), notes=tuple(sorted(notes)))
 
 
-def contents(folder: Path | str, expected: tuple[str, ...] = DATASET_FILES,
-             required: str | None = None) -> tuple[dict, tuple[str, ...]]:
+def contents(folder: Path | str, required: str | None = None,
+             expected: tuple[str, ...] = DATASET_FILES) -> tuple[dict, tuple[str, ...]]:
     """Sources (dict of Path or Table) of the files of a folder by name, and notes.
 
     Raises DatasetError if the folder cannot be read, the file `required` is missing, or two files
@@ -178,43 +186,42 @@ def contents(folder: Path | str, expected: tuple[str, ...] = DATASET_FILES,
     missing = [name for name in LIMITS if name in expected and name not in found]
     reasons = []
     for path in paths:
-        if missing and path.suffix.lower() == ".mat":
-            matrices, reason = _matrices(path, missing)
+        if missing and path.suffix.lower() == ".mat" and path.is_file():
+            matrices = _matrices(path, missing)
             sources += matrices
             if not matrices:
-                reasons.append(reason)
+                reasons.append(f"{path.name}: expected a matrix named as {' or '.join(missing)} of "
+                               "a file that 'save -v7' wrote.")
     files = {}
     for name, source in sources:
         earlier = files.setdefault(name, source)
         require(earlier is source, folder / source.name, f"only one {name}", earlier.name)
-    notes = [f"{source.name} was read as {name}." for name, source in files.items()
-             if source.name.lower() != name.lower()]
+    renamed = [f"{source.name} as {name}" for name, source in files.items()
+               if source.name.lower() != name.lower()]
+    notes = [f"Read {', '.join(renamed)}."] if renamed else []
     used = [source.name.split(",")[0] for source in files.values()]
     others = [path for path in paths if path.name not in used]
     not_read = _not_read(others) + reasons
-    if required is not None:
+    if required:
         told = " ".join(["this file, found none.", *not_read])
         require(required in files, folder / required, told)
     return files, tuple(notes + not_read)
 
 
 def _matrices(path, names):
-    """Pairs (list) of one of `names` and the Table of the matrix so named, and why if none is."""
+    """Pairs (list) of one of `names` and the Table of the matrix so named in a .mat file."""
     by_stem = {Path(name).stem.lower(): name for name in names}
     try:
-        require(path.is_file(), path, "a file that can be read")
         found = loadmat(path)
-    except Exception as error:  # scipy raises many kinds about other versions and bytes
-        found = {str(error): None}
+    except Exception:  # scipy raises many kinds about other versions and bytes
+        return []
     tables = []
     for variable, value in found.items():
         name = by_stem.get(variable.lower())
         if name:
             source = f"{path}, variable {variable}"
             tables.append((name, table_of_array(source, value, LIMITS[name])))
-    told = ", ".join(variable for variable in found if not variable.startswith("__"))
-    return tables, (f"{path.name}: expected a matrix named as {' or '.join(names)} of a file that "
-                    f"'save -v7' wrote, found {told!r}.")
+    return tables
 
 
 def datasets_in(data: Path, names: list[str] | None = None) -> tuple[list[str], list[str]]:

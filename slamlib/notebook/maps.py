@@ -13,7 +13,7 @@ HALF_WIDTH, WIDTH = 4.08, 7.4      # inches: half the width of the page, and all
 FLAT = 0.55                        # height of a map over its width, below which it needs all of it
 ABOVE_AND_BELOW = 0.8              # inches, for title, label and legend
 # Places of a name relative to its landmark, in font sizes, in the order in which they are tried.
-NAME_OFFSETS = (1, 0.9), (-1, 0.9), (1, -0.9), (-1, -0.9), (0, 1.4), (0, -1.4), (1.6, 0), (-1.6, 0)
+NAME_OFFSETS = (1, 0.9), (-1, 0.9), (1, -0.9), (-1, -0.9)
 MOST_NAMES = 60                    # number of markers, beyond which the map names antennas only
 HALO = withStroke(linewidth=1.5, foreground="white")       # so that a name on the path can be read
 
@@ -27,18 +27,16 @@ def whole_map(drive, result) -> Figure:
     confirms. Names of antennas begin with A. Names of more than MOST_NAMES markers, and those
     without a free place, are left out; pages tell them under the pointer.
     """
-    shown = np.concatenate([
-        result.poses[:, :2], result.marker_in_world[:, :2], result.antenna_in_world])
-    fig, ax = plt.subplots(figsize=_size(shown))
+    landmarks = np.concatenate([result.marker_in_world[:, :2], result.antenna_in_world])
+    fig, ax = plt.subplots(figsize=_size(np.concatenate([result.poses[:, :2], landmarks])))
     ax.set_title(drive.name)
     truth = drive.truth
     role = "slam_uwb" if len(result.antenna) else "slam"
     enlarged = plotting.enlargement(result.poses, result.covariances)
+    if truth is not None:                                    # below the path, which covers it
+        plotting.trajectory(ax, truth.poses, "truth", linewidth=3.5, linestyle="-", alpha=0.25)
     plotting.with_ellipses(ax, result.poses, result.covariances, role, "vehicle", enlarged,
                            count=24)
-    if truth is not None:
-        plotting.trajectory(ax, truth.poses, "truth", linewidth=3.5, linestyle="-", alpha=0.25,
-                            zorder=2)                        # below the path, which covers it
     if len(result.marker):
         plotting.ellipses(ax, result.marker_in_world, result.marker_covariance,
                           plotting.ROLES["aruco"]["color"], enlarged=enlarged)
@@ -56,7 +54,7 @@ def whole_map(drive, result) -> Figure:
     plotting.legend_below(fig)
     fig.draw_without_rendering()                                  # fixes the axes for the names
     taken = []
-    signs = ax.transData.transform(shown)
+    signs = ax.transData.transform(landmarks)
     ranged = (drive.dataset.uwb or NO_RANGES).antenna
     seen = result.sightings.marker[~result.rejected]
     for kind, letter, size, doubtful, measured in (
@@ -87,22 +85,18 @@ def _size(places):
 
 
 def _write_name(ax, place, name, size, taken, signs):
-    """Write a name beside its place (2,) in m, where it covers none of the boxes `taken`.
+    """Write a name beside its place (2,) in m, which covers no box `taken` and none of the `signs`.
 
-    Of these places it takes one that covers the fewest of the `signs` (n, 2), in pixels. Its own
-    box joins the others. Without a free place within the axes there is no name.
+    These are (n, 2) in pixels. Its own box joins the others. Without a free place within the axes
+    there is no name.
     """
     text = ax.annotate(name, place, (0, 0), textcoords="offset points", ha="center", va="center",
                        fontsize=size, zorder=7, in_layout=False, path_effects=[HALO])
-    free = []
     for offset in size * np.array(NAME_OFFSETS):
         text.set_position(offset)
         box = text.get_window_extent()
-        if ax.bbox.count_contains(box.corners()) == 4 and not box.count_overlaps(taken):
-            free.append((offset, box))
-    if not free:
-        text.remove()
-        return
-    best, own = min(free, key=lambda each: each[1].count_contains(signs))
-    text.set_position(best)
-    taken.append(own)
+        is_inside = ax.bbox.count_contains(box.corners()) == 4
+        if is_inside and not box.count_overlaps(taken) and not box.count_contains(signs):
+            taken.append(box)
+            return
+    text.remove()

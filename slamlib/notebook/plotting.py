@@ -17,7 +17,6 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
-from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 from matplotlib_inline.backend_inline import set_matplotlib_formats
@@ -193,9 +192,8 @@ def ellipses(ax: Axes, positions: np.ndarray, covariances: np.ndarray, color: st
     angle = np.pi * np.arange(40) / 20
     circle = np.stack([np.cos(angle), np.sin(angle)])
     outlines = positions[:, :2, None] + directions * half_axes[:, None] @ circle
-    edge = 0.6 * np.array(to_rgb(color))                  # darker than the path below them
-    ax.add_collection(PolyCollection(outlines.mT, facecolors=(color, fill), edgecolors=edge,
-                                     linewidths=0.9, zorder=3.5))
+    ax.add_collection(PolyCollection(outlines.mT, facecolors=(color, fill), edgecolors="#333333",
+                                     linewidths=0.5, zorder=3.5))
     ax.autoscale_view()
     return ax
 
@@ -240,7 +238,7 @@ def enlargement(poses: np.ndarray, covariances: np.ndarray) -> int:
 def evenly(poses: np.ndarray, count: int) -> np.ndarray:
     """Indices of at most `count` known poses at equal intervals, the last one included."""
     known = np.flatnonzero(np.isfinite(poses[:, 0]))
-    step = math.ceil(len(known) / count) or 1
+    step = 1 + len(known) // count
     return known[::-step]
 
 

@@ -9,7 +9,7 @@ from IPython.display import Markdown
 
 from slamlib.core import evaluation, se2
 from slamlib.notebook.plotting import estimates, places_by_id
-from slamlib.robust.calibration import RANGES, WHEELS
+from slamlib.robust.calibration import RANGES
 
 DASH = "–"
 # What begins a cell of a column of numbers, or is an italic remark in it.
@@ -55,22 +55,20 @@ def cell(value) -> str:
 
 def number(value: float, decimals: int | None = None) -> str:
     """A value with three significant digits, or this number of decimals (str)."""
-    if abs(value) > 1e6:                       # the method failed
-        return "> 10⁶"
     if decimals is None:
-        decimals = _decimals(value, 3) if value else 0
+        decimals = _decimals(value, 3)
     return f"{value:z,.{decimals}f}".replace("-", "−")
 
 
 def _decimals(value, digits):
     """Number (int) of decimals, at most 7, with this number of significant digits of a value."""
-    exponent = np.floor(np.log10(abs(value)))
+    exponent = np.floor(np.log10(abs(value) or 1))
     return int(np.clip(digits - 1 - exponent, 0, 7))
 
 
 def estimate(value: float, sigma: float) -> str:
     """Text (str) of a value ± its standard deviation, which has two digits."""
-    decimals = _decimals(sigma, 2) if sigma else 2
+    decimals = _decimals(sigma, 2)
     return f"{number(value, decimals)} ± {number(sigma, decimals)}"
 
 
@@ -131,24 +129,21 @@ def map_accuracy(result, drive, kind: str) -> dict:
 
 
 def calibration_rows(result, drive) -> Iterator[dict]:
-    """Rows of `table` on what a SlamResult estimates of its calibration: stated, estimated, true.
+    """Rows of `table` on what a SlamResult estimates of its calibration: stated and estimated.
 
-    The true value is that of the wheels of a simulated Drive. The last row is the factor on the
-    standard deviations of the ranges, if it is learned.
+    The last row is the factor on the standard deviations of the ranges, if it is learned.
     """
-    has_ranges = len(result.antenna) > 0
-    for k, entry in enumerate(result.calibration_table[:None if has_ranges else RANGES.start]):
+    antenna_count = len(result.antenna)
+    for entry in result.calibration_table[:None if antenna_count else RANGES.start]:
         if entry["sigma"]:
             stated = f"{entry['stated']:g}"
             if entry["stated_sigma"]:
                 stated += f" ± {entry['stated_sigma']:.3g}"
             estimated = estimate(entry["estimate"], entry["sigma"])
-            row = {"dataset": drive.name, "entry": f"`{entry['name']}`",
-                   "unit": entry["unit"] or None, "stated": stated, "estimated": estimated}
-            if k < WHEELS.stop and drive.origin == "simulated":
-                row["true"] = f"{getattr(drive.truth.vehicle, entry['name']):.6g}"
-            yield row | {"used": "estimate" if entry["released"] else "both"}
-    if has_ranges and not drive.dataset.vehicle.range_noise_factor:
+            yield {"dataset": drive.name, "entry": f"`{entry['name']}`",
+                   "unit": entry["unit"] or None, "stated": stated, "estimated": estimated,
+                   "used": "estimate" if entry["released"] else "both"}
+    if antenna_count and not drive.dataset.vehicle.range_noise_factor:
         factor = result.noise.ranges
         yield {"dataset": drive.name, "entry": "`range_noise_factor`",
                "estimated": estimate(factor, factor * result.noise_sigma[2]), "used": "estimate"}

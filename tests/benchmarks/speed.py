@@ -52,12 +52,12 @@ def plain(folder):
                                 capture_output=True, text=True).stdout)
 
 
-def pairs(count=PAIRS):
+def pairs():
     """Print the times of `solve` and of the plain script on data/long, one after the other."""
     print(f"solve {LONG.name}, all problems, whole process, beside the plain script's problem 4")
     print(f"{'solve (s)':>12}{'plain (s)':>12}{'ratio':>8}")
     ratios = []
-    for _ in range(count):
+    for _ in range(PAIRS):
         (ours, parts), theirs = solve(LONG), plain(LONG)
         ratios.append(ours / theirs)
         print(f"{ours:12.2f}{theirs:12.2f}{ours / theirs:8.2f}", flush=True)
@@ -114,7 +114,6 @@ def main():
     if LONG.exists():
         pairs()
     shapes()
-    print(f"load {os.getloadavg()[0]:.2f} after")
 
 
 if __name__ == "__main__":
