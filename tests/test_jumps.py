@@ -255,8 +255,8 @@ def test_the_doubt_names_three_stretches_and_counts_the_others():
     poses[100:104, 0] = 0.9
     result = SimpleNamespace(jumps=jumps.find_jumps(seen(poses)))
     sentence, = (doubt.sentence for doubt in _encoder_doubts(result))
-    assert "between poses 50 and 51 the vehicle moved by 0.00 m and 0 degrees, but the markers " \
-        "say 0.30 m and 0 degrees, which ends 0.30 m" in sentence
+    assert "between poses 50 and 51 the vehicle moved by 0.00 m and 0°, but the markers " \
+        "say 0.30 m and 0°, which ends 0.30 m" in sentence
     assert sentence.count("between") == 3 and "and 2 more times" in sentence
 
 

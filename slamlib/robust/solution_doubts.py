@@ -26,6 +26,7 @@ MIN_REJECTED_OF_MARKER = 5   # number of its sightings, from which a marker is n
 MAX_REJECTED_OF_MARKER = 0.2     # share of its sightings, the same
 MAX_MARKERS_NAMED = 8        # of those, in one sentence
 MAX_STRETCHES_NAMED = 3      # of the drive, where counts and markers contradict each other
+MIN_TOLD_SIGMAS = 2.0        # of its own sigmas, by which an estimate that is named is off
 # Sigmas of a pose, and relative of a sigma, by engine and GTSAM. Sightings of points are
 # coordinates in one, bearing and distance in the other: up to 0.11 on clean drives.
 MAX_DISAGREEMENT = 0.25
@@ -79,15 +80,19 @@ def _calibration_doubts(result):
     table = np.array(result.calibration_table)
     rows = {group: table[result.calibration.of_group(group)] for group in GROUPS}
 
+    def sigmas_off(row):
+        return abs(row["estimate"] - row["stated"]) / row["sigma"]
+
     def distance(group):
-        return max(abs(row["estimate"] - row["stated"]) / row["sigma"] for row in rows[group])
+        return max(map(sigmas_off, rows[group]))
 
     furthest = max(either, key=distance, default=None)
     problem = "problem 4" if len(result.antenna) else "problem 3"
     for group, (_, advice) in GROUPS.items():
         if group not in common and group != furthest:
             continue
-        numbers = " and ".join(map(_estimated_and_stated, rows[group]))
+        off = [row for row in rows[group] if sigmas_off(row) > MIN_TOLD_SIGMAS]
+        numbers = " and ".join(map(_estimated_and_stated, off or rows[group]))
         sentence = f"By the drive {numbers}; {problem} uses this."
         if group == "camera-bump":
             sentence = f"From pose {result.jumps.bump + 1} on the camera is elsewhere. {sentence}"
@@ -145,7 +150,7 @@ def _motion(increment):
     """Distance and turn of an increment (3,), in words."""
     distance = np.hypot(increment[0], increment[1])
     turn = np.degrees(np.abs(se2.wrap(increment[2])))
-    return f"{distance:.2f} m and {turn:.0f} degrees"
+    return f"{distance:.2f} m and {turn:.0f}°"
 
 
 class _Kind(NamedTuple):
