@@ -172,8 +172,9 @@ def sighting_error(
     and 0. `is_bumped` (m,) is where the camera is elsewhere. The derivatives are (m, 3, 3),
     (m, 3, 3) and (m, 3, 8). GTSAM: BetweenFactorPose2.
     """
-    after = is_bumped[:, None]
-    camera = c[CAMERA] + after * c[BUMP]
+    camera = c[CAMERA]
+    if is_bumped.any():
+        camera = camera + is_bumped[:, None] * c[BUMP]
     unit = [c[SIZE], c[SIZE], 1]
     mounted = se2.compose(motion, camera)                # camera in vehicle
     Y = se2.compose(poses, mounted)
@@ -192,7 +193,7 @@ def sighting_error(
     by_Y = -by_seen @ se2.by_left_perturbation(seen)
     by_pose, by_camera, by_lag = _by_sensor(by_Y, mounted, camera, velocity)
     by_size = -by_seen[:, :, :2] @ h[:, :2, None]
-    by_bump = after[:, None] * by_camera
+    by_bump = is_bumped[:, None, None] * by_camera
     return e, by_pose, by_marker, np.concatenate([by_camera, by_size, by_lag, by_bump], axis=2)
 
 
