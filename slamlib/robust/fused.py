@@ -336,7 +336,7 @@ def _predicted(state, odometry, k, Q, memory):
     L = np.zeros(state.P.shape[:2] + (3,))
     L[:, POSE] = by_delta
     L[:, MARKERS] = M_by_D @ D_by_delta
-    identity = np.tile(np.eye(9), (len(D), 1, 1))
+    identity = np.broadcast_to(np.eye(9), (len(D), 9, 9))
     F = _block_diagonal(identity, M_by_M)
     F[:, POSE, POSE] = by_X
     F[:, :, WHEELS] += L @ odometry.by_w[k]
@@ -375,14 +375,11 @@ def _updated(state, sightings, row, memory, variance):
     new_part = variance * (1 - memory**2)
     C = new_part[:, None] * sightings.C[known]
     state, accepted = _measured(state, number, sightings.z[known], C)
-    index = np.append([0, 1, 2], 3 + number[accepted])
-    rows = _rows(index).ravel()
-    P = state.P[:, rows[:, None], rows]
     z_new = np.tile(sightings.z[new], (len(memory), 1, 1))
     used = np.append(known[accepted], new)
     return state._replace(
-        x=np.concatenate([state.x[:, index], z_new], axis=1),
-        P=_block_diagonal(P, variance[:, None] * sightings.C[new]),
+        x=np.concatenate([state.x, z_new], axis=1),
+        P=_block_diagonal(state.P, variance[:, None] * sightings.C[new]),
         marker=sightings.marker[used],
         z=sightings.z[used])
 
@@ -390,8 +387,9 @@ def _updated(state, sightings, row, memory, variance):
 def _measured(state, number, z, C):
     """The predicted _State after sightings z (m, 3) of markers, and which of them it accepts, (m,).
 
-    With covariances C (h, m, 3, 3). A sighting beyond the gate of the likeliest filter is wrong. It
-    is equally likely by all filters: as one at the gate by the least certain.
+    With covariances C (h, m, 3, 3); it keeps the accepted markers only. A sighting beyond the gate
+    of the likeliest filter is wrong. It is equally likely by all filters: as one at the gate by the
+    least certain.
     """
     expected = 3 + len(state.marker) + number
     rows = _rows(expected)
@@ -404,16 +402,19 @@ def _measured(state, number, z, C):
     cost_of_wrong = np.minimum(by_certain, GATE + log_determinant.max(axis=0))
     cost = cost_of_wrong[:, ~accepted].sum(axis=1)
 
+    index = np.append([0, 1, 2], 3 + number[accepted])
+    kept = _rows(index).ravel()
     H = rows[accepted].ravel()
-    HP = state.P[:, H]
-    S = HP[:, :, H] + _block_diagonal(np.zeros((len(C), 0, 0)), C[:, accepted])
-    innovation = innovation[:, accepted].reshape(len(C), -1)
-    cost += se2.squared_norms(innovation, S) + np.linalg.slogdet(S)[1]
-    gain = np.linalg.solve(S, HP).mT
-    change = np.matvec(gain, innovation)
-    P = state.P - gain @ HP
+    HP = state.P[:, H[:, None], kept]
+    S = state.P[:, H[:, None], H] + _block_diagonal(np.zeros((len(C), 0, 0)), C[:, accepted])
+    innovation = innovation[:, accepted].reshape(len(C), -1, 1)
+    solved = np.linalg.solve(S, np.concatenate([HP, innovation], axis=2))
+    cost += np.sum(innovation * solved[:, :, -1:], axis=(1, 2)) + np.linalg.slogdet(S)[1]
+    gain = solved[:, :, :-1].mT
+    x = state.x[:, index]
+    P = state.P[:, kept[:, None], kept] - gain @ HP
     return state._replace(
-        x=state.x + change.reshape(state.x.shape),
+        x=x + (gain @ innovation).reshape(x.shape),
         P=(P + P.mT) / 2,
         log_density=state.log_density - cost / 2,
         rejected=state.rejected + np.count_nonzero(~accepted)), accepted
