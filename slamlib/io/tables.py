@@ -141,19 +141,21 @@ def _table_of_text(path, columns, may_have_z):
         how.add("without its header line")
     for line in lines:
         cells = cells_of(rows[line])
-        try:
-            row = [float(cell.replace(",", ".") or "nan") for cell in cells]
-        except ValueError:
-            row = []
         if "," in "".join(cells):
             how.add("with decimal commas")
+            cells = [cell.replace(",", ".") for cell in cells]
+        try:
+            row = [float(cell or "nan") for cell in cells]
+        except ValueError:
+            row = []
         while len(row) > count and np.isnan(row[-1]):
             row.pop()
         if may_have_z and len(row) == count + 1:
             row.pop()
             how.add("without z, its fourth column")
-        require(len(row) == count, f"{path}, line {line}",
-                f"{count} numbers ({', '.join(columns)})", rows[line])
+        if len(row) != count:
+            require(False, f"{path}, line {line}", f"{count} numbers ({', '.join(columns)})",
+                    rows[line])
         numbers.append(row)
     table = Table(path, np.array(numbers).reshape(-1, count), np.array(lines))
     if how:
