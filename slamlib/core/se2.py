@@ -74,16 +74,21 @@ def difference(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return r
 
 
-def compose_jacobians(T_ab: np.ndarray, T_bc: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Derivatives of compose, d T_ac / d T_ab and d T_ac / d T_bc, each (..., 3, 3)."""
-    T_ab = np.asarray(T_ab)
+def compose_with_jacobians(T_ab: np.ndarray, T_bc: np.ndarray) -> tuple[np.ndarray, ...]:
+    """T_ac = T_ab T_bc, (..., 3), and its derivatives by T_ab and T_bc, each (..., 3, 3)."""
+    T_ab = np.asarray(T_ab, dtype=float)
     lever = _turned(T_bc, T_ab[..., 2])                  # position of c from b, in axes of a
     by_first = _identity(lever.shape)
     by_first[..., 0, 2] = -lever[..., 1]
     by_first[..., 1, 2] = lever[..., 0]
     by_second = _identity(lever.shape)
     by_second[..., :2, :2] = rotation(T_ab[..., 2])
-    return by_first, by_second
+    return T_ab + lever, by_first, by_second
+
+
+def compose_jacobians(T_ab: np.ndarray, T_bc: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Derivatives of compose, d T_ac / d T_ab and d T_ac / d T_bc, each (..., 3, 3)."""
+    return compose_with_jacobians(T_ab, T_bc)[1:]
 
 
 def by_left_perturbation(T: np.ndarray) -> np.ndarray:
@@ -94,20 +99,24 @@ def by_left_perturbation(T: np.ndarray) -> np.ndarray:
 def compose_uncertain(T_ab: np.ndarray, C_ab: np.ndarray, T_bc: np.ndarray,
                       C_bc: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """T_ac, (..., 3), and its covariance (..., 3, 3), by independent motions and covariances."""
-    A, B = compose_jacobians(T_ab, T_bc)
-    C_ac = A @ C_ab @ A.mT + B @ C_bc @ B.mT
-    return compose(T_ab, T_bc), C_ac
+    T_ac, A, B = compose_with_jacobians(T_ab, T_bc)
+    return T_ac, A @ C_ab @ A.mT + B @ C_bc @ B.mT
 
 
-def between_jacobians(T_wa: np.ndarray, T_wb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Derivatives of between, d T_ab / d T_wa and d T_ab / d T_wb, each (..., 3, 3)."""
+def between_with_jacobians(T_wa: np.ndarray, T_wb: np.ndarray) -> tuple[np.ndarray, ...]:
+    """T_ab = inverse(T_wa) T_wb, (..., 3), and its derivatives by T_wa and T_wb, (..., 3, 3)."""
     T_ab = between(T_wa, T_wb)
     by_second = _identity(T_ab.shape)
     by_second[..., :2, :2] = rotation(-np.asarray(T_wa)[..., 2])
     by_first = -by_second
     by_first[..., 0, 2] = T_ab[..., 1]
     by_first[..., 1, 2] = -T_ab[..., 0]
-    return by_first, by_second
+    return T_ab, by_first, by_second
+
+
+def between_jacobians(T_wa: np.ndarray, T_wb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Derivatives of between, d T_ab / d T_wa and d T_ab / d T_wb, each (..., 3, 3)."""
+    return between_with_jacobians(T_wa, T_wb)[1:]
 
 
 def log(T: np.ndarray) -> np.ndarray:

@@ -180,9 +180,9 @@ def sighting_error(
     Y = se2.compose(poses, mounted)
     seen = se2.between(Y, markers)
     h = seen / unit
-    difference = se2.between(z, h)
+    difference, _, by_expected = se2.between_with_jacobians(z, h)
     e = se2.log(difference)
-    by_h = se2.log_jacobian(difference) @ se2.between_jacobians(z, h)[1]
+    by_h = se2.log_jacobian(difference) @ by_expected
     is_point = ~as_pose
     e[is_point] = (h - z)[is_point] * [1, 1, 0]
     by_h[is_point] = np.diag([1.0, 1, 0])
@@ -236,7 +236,7 @@ def _by_sensor(by_Y, mounted, place, velocity):
     """
     by_pose = by_Y @ inverse_adjoint(mounted)
     by_place = by_Y @ inverse_adjoint(place * [0, 0, 1])
-    by_lag = -by_Y @ inverse_adjoint(place) @ velocity[..., None]
+    by_lag = -by_Y @ (inverse_adjoint(place) @ velocity[..., None])
     return by_pose, by_place, by_lag
 
 

@@ -330,8 +330,8 @@ def _predicted(state, odometry, k, Q, memory):
     M = state.x[:, 3:]
     delta = odometry.delta(k, state.x[:, 1])
     D, D_by_delta, D_by_camera = _in_camera(delta, state.x[:, 2])
-    by_X, by_delta = se2.compose_jacobians(X, delta)
-    M_by_D, M_by_M = se2.between_jacobians(D[:, None], M)
+    X_new, by_X, by_delta = se2.compose_with_jacobians(X, delta)
+    M_new, M_by_D, M_by_M = se2.between_with_jacobians(D[:, None], M)
     M_by_D = M_by_D.reshape(len(D), -1, 3)
     L = np.zeros(state.P.shape[:2] + (3,))
     L[:, POSE] = by_delta
@@ -345,10 +345,9 @@ def _predicted(state, odometry, k, Q, memory):
     F = np.concatenate([F, F[:, MARKERS] - memory * M_before], axis=1)
     L = np.concatenate([L, L[:, MARKERS]], axis=1)
     x = state.x.copy()
-    x[:, 0] = se2.compose(X, delta)
-    x[:, 3:] = se2.between(D[:, None], M)
-    error = se2.difference(state.z, M)
-    expected = x[:, 3:] + memory * error
+    x[:, 0] = X_new
+    x[:, 3:] = M_new
+    expected = M_new + memory * se2.difference(state.z, M)
     return state._replace(
         x=np.concatenate([x, expected], axis=1),
         P=F @ state.P @ F.mT + L @ Q @ L.mT)
@@ -356,11 +355,10 @@ def _predicted(state, odometry, k, Q, memory):
 
 def _in_camera(delta, camera):
     """D = c^-1 Delta c (h, 3), the motion of the camera, and its derivatives by Delta and c."""
-    moved = se2.compose(delta, camera)
-    moved_by_delta, moved_by_camera = se2.compose_jacobians(delta, camera)
-    D_by_camera, D_by_moved = se2.between_jacobians(camera, moved)
+    moved, moved_by_delta, moved_by_camera = se2.compose_with_jacobians(delta, camera)
+    D, D_by_camera, D_by_moved = se2.between_with_jacobians(camera, moved)
     by_camera = D_by_camera + D_by_moved @ moved_by_camera
-    return se2.between(camera, moved), D_by_moved @ moved_by_delta, by_camera
+    return D, D_by_moved @ moved_by_delta, by_camera
 
 
 def _updated(state, sightings, row, memory, variance):
@@ -446,9 +444,9 @@ def _poses_from_frames(dataset, jumps, frame, slip, x, P):
     odometry = _odometry(dataset, jumps, frame[last], pose)
     X = x[last, 0]
     delta = odometry.delta(pose, x[last, 1])
-    by_X, by_delta = se2.compose_jacobians(X, delta)
+    poses, by_X, by_delta = se2.compose_with_jacobians(X, delta)
     F = np.concatenate([by_X, by_delta @ odometry.by_w], axis=2)
     Q = odometry.noise(pose, slip)
     by_frame = F @ P[last, :6, :6] @ F.mT
     by_odometry = by_delta @ Q @ by_delta.mT
-    return se2.compose(X, delta), by_frame + by_odometry
+    return poses, by_frame + by_odometry

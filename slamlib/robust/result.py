@@ -326,7 +326,7 @@ def _from_frame(problem, state, row, pose, is_after):
     start, end = (pose, frame) if is_after else (frame, pose)
     motion, motion_by_wheel = increments.between_poses(
         ticks, vehicle, frame, pose, problem.odometry.model)
-    by_frame, by_motion = se2.compose_jacobians(X, motion)
+    at_pose, by_frame, by_motion = se2.compose_with_jacobians(X, motion)
     rounding, slipping = odometry_noise(ticks, vehicle, start, end)
     Q = rounding + problem.noise.slip**2 * slipping          # in the axes of `start`
     by_increment = by_motion
@@ -334,7 +334,7 @@ def _from_frame(problem, state, row, pose, is_after):
         increment = se2.inverse(motion)
         by_increment = by_motion @ se2.between_jacobians(increment, np.zeros(3))[0]
     return _Side(
-        pose=se2.compose(X, motion), by_frame=by_frame, by_wheel=by_motion @ motion_by_wheel,
+        pose=at_pose, by_frame=by_frame, by_wheel=by_motion @ motion_by_wheel,
         noise=by_increment @ Q @ by_increment.mT,
         jump=m.jumps.share(start, end).sum(axis=1)[:, None, None])
 
