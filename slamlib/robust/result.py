@@ -27,7 +27,13 @@ from slamlib.robust.initialization import (
     trilaterate,
 )
 from slamlib.robust.linear import Problem, State
-from slamlib.robust.solution import GtsamSolution, graph_of, solved_noise, values_of
+from slamlib.robust.solution import (
+    GtsamSolution,
+    graph_of,
+    places_of,
+    solved_noise,
+    values_of,
+)
 
 MIN_ACCEPTED_RANGES = 5      # number of accepted ranges of an antenna that is not in doubt
 SAME_MARKER = 0.05           # m, distance of two markers that must be one
@@ -208,22 +214,15 @@ def _agreement(solution, engine, few_ranges):
     of_antennas = in_both[len(in_both) - len(few_ranges):]
     of_antennas[few_ranges] = False
     sigma = np.sqrt(_variances(engine)[in_both])
-    difference = se2.between(_places(engine), _places(solution))
+    difference = se2.between(places_of(engine.state), places_of(solution.state))
     difference[:, 2] = se2.wrap(difference[:, 2])
     off = np.abs(difference[in_both]) / sigma
     ratio = np.abs(np.sqrt(variances[in_both]) / sigma - 1)
     return float(off.max(initial=0.0)), float(ratio.max(initial=0.0))
 
 
-def _places(solution):
-    """Poses, markers and antennas (f + k + a, 3) of a solution, antennas with heading 0."""
-    state = solution.state
-    antennas = np.pad(state.antennas, ((0, 0), (0, 1)))
-    return np.concatenate([state.poses, state.markers, antennas])
-
-
 def _variances(solution):
-    """Variances (f + k + a, 3) of the same, of poses and markers in their own axes."""
+    """Variances (f + k + a, 3) of a solution, of poses and markers in their own axes."""
     blocks = np.concatenate([solution.frames, solution.landmarks])
     return np.diagonal(blocks, axis1=1, axis2=2)
 
