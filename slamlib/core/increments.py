@@ -199,8 +199,7 @@ def odometry_error(increments: OdometryIncrements, poses: np.ndarray,
     measured = increments.increment + increments.J_wheel @ (wheel - increments.wheel)
     expected = se2.between(poses[:-1], poses[1:])
     difference, by_measured, by_expected = se2.between_with_jacobians(measured, expected)
-    e = se2.log(difference)
-    J = se2.log_jacobian(difference)
+    e, J = se2.log_with_jacobian(difference)
     by_first = -J @ by_expected @ se2.by_left_perturbation(expected)
     by_second = J @ se2.compose_jacobians(difference, np.zeros(3))[1]
     by_poses = np.concatenate([by_first, by_second], axis=2)

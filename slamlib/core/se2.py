@@ -125,23 +125,16 @@ def log(T: np.ndarray) -> np.ndarray:
     It is [a x + h y / 2, -h x / 2 + a y, h] with the wrapped heading h and a = (h / 2) cot(h / 2).
     GTSAM computes the error of its between factors with it (`Pose2::Logmap`).
     """
+    return log_with_jacobian(T)[0]
+
+
+def log_with_jacobian(T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """`log` of motions T (..., 3), and its derivative by [x, y, heading], (..., 3, 3)."""
     T = np.asarray(T, dtype=float)
     x = T[..., 0]
     y = T[..., 1]
     h = wrap(T[..., 2])
-    a = _half_cotangent(h)
-    v_x = a * x + h * y / 2
-    v_y = -h * x / 2 + a * y
-    return _poses(v_x, v_y, h)
-
-
-def log_jacobian(T: np.ndarray) -> np.ndarray:
-    """Derivative of `log` at motions T (..., 3) by [x, y, heading], (..., 3, 3)."""
-    T = np.asarray(T, dtype=float)
-    x = T[..., 0]
-    y = T[..., 1]
-    h = wrap(T[..., 2])
-    a = _half_cotangent(h)
+    a = np.cos(h / 2) / np.sinc(h / (2 * np.pi))             # (h / 2) cot(h / 2)
     small = np.abs(h) < 1e-3                                 # there the derivative of a cancels
     safe = np.where(small, 1.0, h)
     quotient = (a - a**2 - h**2 / 4) / safe
@@ -153,12 +146,7 @@ def log_jacobian(T: np.ndarray) -> np.ndarray:
     jacobian[..., 1, 0] = -h / 2
     jacobian[..., 1, 1] = a
     jacobian[..., 1, 2] = a_by_h * y - x / 2
-    return jacobian
-
-
-def _half_cotangent(h):
-    """(h / 2) cot(h / 2)."""
-    return np.cos(h / 2) / np.sinc(h / (2 * np.pi))
+    return _poses(a * x + h * y / 2, a * y - h * x / 2, h), jacobian
 
 
 def rotate_covariance(covariance: np.ndarray, heading: np.ndarray) -> np.ndarray:

@@ -181,8 +181,8 @@ def sighting_error(
     seen = se2.between(Y, markers)
     h = seen / unit
     difference, _, by_expected = se2.between_with_jacobians(z, h)
-    e = se2.log(difference)
-    by_h = se2.log_jacobian(difference) @ by_expected
+    e, J = se2.log_with_jacobian(difference)
+    by_h = J @ by_expected
     is_point = ~as_pose
     e[is_point] = (h - z)[is_point] * [1, 1, 0]
     by_h[is_point] = np.diag([1.0, 1, 0])

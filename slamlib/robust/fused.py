@@ -344,12 +344,9 @@ def _predicted(state, odometry, k, Q, memory):
     M_before = np.eye(F.shape[1])[MARKERS]
     F = np.concatenate([F, F[:, MARKERS] - memory * M_before], axis=1)
     L = np.concatenate([L, L[:, MARKERS]], axis=1)
-    x = state.x.copy()
-    x[:, 0] = X_new
-    x[:, 3:] = M_new
     expected = M_new + memory * se2.difference(state.z, M)
     return state._replace(
-        x=np.concatenate([x, expected], axis=1),
+        x=np.concatenate([X_new[:, None], state.x[:, 1:3], M_new, expected], axis=1),
         P=F @ state.P @ F.mT + L @ Q @ L.mT)
 
 
