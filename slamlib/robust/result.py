@@ -16,7 +16,6 @@ from slamlib.core.graph import GUESS_PRIOR_SIGMA
 from slamlib.core.increments import odometry_noise
 from slamlib.robust.calibration import WHEELS, calibration_table
 from slamlib.robust.covariances import posterior_moments
-from slamlib.robust.factors import MIN_DISTANCE
 from slamlib.robust.fit import Fit, error_memories, residuals
 from slamlib.robust.initialization import (
     SAME_PLACE,
@@ -293,9 +292,7 @@ def worst_sigma(ranges: AntennaRanges, estimate: np.ndarray, weight: np.ndarray)
 
     Its covariance in the world also includes the uncertain heading of pose 1.
     """
-    difference = estimate - ranges.positions
-    distance = np.maximum(np.linalg.norm(difference, axis=1), MIN_DISTANCE)
-    direction = difference / distance[:, None]
+    direction = ranges.directions(estimate)
     weighted = direction * (weight / ranges.sigma**2)[:, None]
     information = np.linalg.eigvalsh(direction.T @ weighted)[0]
     return 1 / np.sqrt(max(information, GUESS_PRIOR_SIGMA**-2))
