@@ -26,13 +26,7 @@ from slamlib.robust.initialization import (
     trilaterate,
 )
 from slamlib.robust.linear import Problem, State
-from slamlib.robust.solution import (
-    GtsamSolution,
-    graph_of,
-    places_of,
-    solved_noise,
-    values_of,
-)
+from slamlib.robust.solution import GtsamSolution, graph_of, places_of, solved_noise, values_of
 
 MIN_ACCEPTED_RANGES = 5      # number of accepted ranges of an antenna that is not in doubt
 SAME_MARKER = 0.05           # m, distance of two markers that must be one

@@ -329,9 +329,9 @@ def averaged(fit: Fit, graph: gtsam.NonlinearFactorGraph, found: GaussNewton,
     off = [values.zeroVectors()]
     moved = values
     if len(points) > 1:
-        linear = [graph_of(problem, noise).linearize(values) for _, noise in points]
         ordering = gtsam.Ordering.ColamdNonlinearFactorGraph(graph)
-        solved = [eliminated(each, ordering) for each in linear]
+        solved = [eliminated(graph_of(problem, noise).linearize(values), ordering)
+                  for _, noise in points]
         marginals = [Marginals(tree) for tree, _ in solved]
         mean = values.zeroVectors()
         for weight, (_, step) in zip(weights, solved):
