@@ -16,8 +16,6 @@ With B(h), which rotates x and y by h and leaves the heading,
 
 import numpy as np
 
-_IDENTITY = np.eye(3)
-
 
 def wrap(angle: np.ndarray) -> np.ndarray:
     """Angles in (-pi, pi] that are equivalent to `angle`, rad, of any shape.
@@ -216,4 +214,4 @@ def _poses(x, y, heading):
 
 def _identity(shape):
     """Identity matrices (..., 3, 3), one for each pose of an array of this shape, (..., 3)."""
-    return np.full(shape + (3,), _IDENTITY)
+    return np.full(shape + (3,), np.eye(3))

@@ -119,12 +119,11 @@ def consensus(marker: np.ndarray, in_world: np.ndarray, covariance: np.ndarray) 
 
 def _central(in_world, covariance):
     """Number of the most certain pose (n, 3) of one marker that agrees with the median."""
+    x, y, _ = np.median(in_world, axis=0)
     heading = in_world[:, 2]
-    columns = np.column_stack([in_world[:, :2], np.sin(heading), np.cos(heading)])
-    x, y, s, c = np.median(columns, axis=0)
-    median = np.array([x, y, np.arctan2(s, c)])
+    theta = np.arctan2(np.median(np.sin(heading)), np.median(np.cos(heading)))
     log_determinant = np.linalg.slogdet(covariance).logabsdet
     typical = covariance[np.argsort(log_determinant)[len(heading) // 2]]
-    squared = se2.squared_distances(in_world, median, covariance + typical)
+    squared = se2.squared_distances(in_world, np.array([x, y, theta]), covariance + typical)
     agrees = squared <= max(GATE, squared.min())
     return np.where(agrees, log_determinant, np.inf).argmin()
