@@ -177,9 +177,10 @@ def gauss_newton(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values,
     """
     values = FixedValues(values)
     error = graph.error(values)
+    ordering = gtsam.Ordering.ColamdNonlinearFactorGraph(graph)
     for steps in range(1, max_steps + 1):
         linear = graph.linearize(values)
-        tree, step = eliminated(linear)
+        tree, step = eliminated(linear, ordering)
         moved, new = after_step(graph, values, step, error)
         LOG.debug("Gauss-Newton step %d: error %.6g", steps, new)
         if error - new <= CONVERGED * (1 + error):
@@ -214,21 +215,20 @@ def descended(moved: Callable[[float], tuple], start: object,
     return start, error
 
 
-def eliminated(linear: gtsam.GaussianFactorGraph) -> tuple[
+def eliminated(linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> tuple[
         gtsam.GaussianBayesTree, gtsam.VectorValues]:
-    """The Bayes tree of a linear graph, and its solution.
+    """The Bayes tree of a linear graph by an ordering of its variables, and its solution.
 
     Cholesky decomposition is fast, but fails where the information is ill-conditioned. There QR
     decomposition decides whether the factors determine every variable. Raises DatasetError if they
     do not.
     """
     try:
-        tree = linear.eliminateMultifrontal()
+        tree = linear.eliminateMultifrontal(ordering)
         return tree, tree.optimize()
     except RuntimeError:
         pass
     try:
-        ordering = gtsam.Ordering.ColamdGaussianFactorGraph(linear)
         tree = linear.eliminateMultifrontal(ordering, gtsam.EliminateQR)
         return tree, tree.optimize()
     except RuntimeError as failure:                      # GTSAM's, with much advice

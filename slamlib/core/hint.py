@@ -55,7 +55,8 @@ def fuse_increments(dataset: Dataset, propagation: Callable = odometry.equation2
         C = covariances[start]
         poses[part], covariances[part] = propagation(ticks[part], vehicle, pose, C)
         if usable[k]:
-            deltas, C_deltas = propagation(ticks[part], vehicle, np.zeros(3), np.zeros((3, 3)))
+            deltas, C_deltas = propagation(
+                ticks[part], vehicle, initial_covariance=np.zeros((3, 3)))
             C_m = found.covariance[k]
             gain = C_deltas[-1] @ np.linalg.inv(C_deltas[-1] + C_m)
             delta = deltas[-1] + gain @ se2.difference(found.increment[k], deltas[-1])

@@ -36,9 +36,8 @@ def between_poses(ticks: np.ndarray, vehicle: Vehicle, start: np.ndarray, end: n
     """Increments (m, 3) by odometry, m and rad, and derivatives (m, 3, 3) by [R_R, R_L, b]."""
     poses = odometry.dead_reckoning(ticks, vehicle, model=model)
     by_w = odometry.wheel_jacobian(ticks, vehicle, model=model)
-    by_start, by_end = se2.between_jacobians(poses[start], poses[end])
-    increment_by_w = by_start @ by_w[start] + by_end @ by_w[end]
-    return se2.between(poses[start], poses[end]), increment_by_w
+    increment, by_start, by_end = se2.between_with_jacobians(poses[start], poses[end])
+    return increment, by_start @ by_w[start] + by_end @ by_w[end]
 
 
 def rounding_and_slipping(ticks: np.ndarray, vehicle: Vehicle, start: np.ndarray,
@@ -199,10 +198,8 @@ def odometry_error(increments: OdometryIncrements, poses: np.ndarray,
     """
     measured = increments.increment + increments.J_wheel @ (wheel - increments.wheel)
     expected = se2.between(poses[:-1], poses[1:])
-    difference = se2.between(measured, expected)
-    by_measured, by_expected = se2.between_jacobians(measured, expected)
-    e = se2.log(difference)
-    J = se2.log_jacobian(difference)
+    difference, by_measured, by_expected = se2.between_with_jacobians(measured, expected)
+    e, J = se2.log_with_jacobian(difference)
     by_first = -J @ by_expected @ se2.by_left_perturbation(expected)
     by_second = J @ se2.compose_jacobians(difference, np.zeros(3))[1]
     by_poses = np.concatenate([by_first, by_second], axis=2)

@@ -62,8 +62,8 @@ class _Common:
     def linearized(self, increment):
         """The _Linearized of increments (l, 3)."""
         delta = increment[self.pair]
-        J_delta, J_second = se2.compose_jacobians(delta, self.z2)
-        r = se2.difference(self.z1, se2.compose(delta, self.z2))
+        expected, J_delta, J_second = se2.compose_with_jacobians(delta, self.z2)
+        r = se2.difference(self.z1, expected)
         information = np.linalg.inv(self.C1 + J_second @ self.C2 @ J_second.mT)
         squared = np.einsum("ni,nij,nj->n", r, information, r)
         return _Linearized(r, J_delta, J_second, information, squared)

@@ -140,15 +140,19 @@ def _relocalized(sightings, confirmed, table, is_known, frame):
     seen = table >= 0
     common = seen[:frame] & seen[frame] & is_known[:frame, None]
     by_common_markers = np.argsort(common.sum(axis=1), kind="stable")
-    for parent in by_common_markers[::-1][:MAX_CANDIDATES]:
-        first = table[parent, common[parent]]
-        second = table[frame, common[parent]]
-        one_pair = np.zeros_like(first)
-        found = robust_increments(sightings.z, sightings.C, one_pair, first, second, 1)
-        sure = found.accepted & confirmed[first] & confirmed[second]
-        if found.usable[0] and (np.sum(found.accepted) > 1 or sure.any()):
-            return _Link(frame, parent, found, pair=0)
-    return None
+    parents = by_common_markers[::-1][:MAX_CANDIDATES]
+    pair, label = np.nonzero(common[parents])
+    first = table[parents[pair], label]
+    second = table[frame, label]
+    count = len(parents)
+    found = robust_increments(sightings.z, sightings.C, pair, first, second, count)
+    is_sure = confirmed[first] & confirmed[second]
+    votes = np.bincount(pair, found.accepted * (1 + is_sure), count)
+    trusted = found.usable & (votes > 1)
+    if not trusted.any():
+        return None
+    best = np.argmax(trusted)
+    return _Link(frame, parents[best], found, best)
 
 
 def _composed(sightings, links, shared_errors):
@@ -165,8 +169,7 @@ def _composed(sightings, links, shared_errors):
             continue
         X = poses[link.parent]
         delta = link.increments.increment[link.pair]
-        poses[f] = se2.compose(X, delta)
-        A, B = se2.compose_jacobians(X, delta)
+        poses[f], A, B = se2.compose_with_jacobians(X, delta)
         by_parent = A @ covariances[link.parent] @ A.T
         by_increment = B @ link.increments.covariance[link.pair] @ B.T
         covariances[f] = by_parent + by_increment
@@ -187,12 +190,11 @@ def _map_markers(sightings, used, path):
     marker = sightings.marker[used]
     X = path.poses[row]
     Z = sightings.z[used]
-    E, F = se2.compose_jacobians(X, Z)
+    in_world, E, F = se2.compose_with_jacobians(X, Z)
     T = E @ path.H[used] @ F.mT
     by_pose = E @ path.covariances[row] @ E.mT
     by_sighting = F @ sightings.C[used] @ F.mT
     covariance = by_pose + by_sighting + T + T.mT
-    in_world = se2.compose(X, Z)
     in_world[:, 2] = se2.wrap(in_world[:, 2])
     best = consensus(marker, in_world, covariance)
     return marker[best], in_world[best], covariance[best]

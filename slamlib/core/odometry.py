@@ -50,8 +50,8 @@ def steps(ticks: np.ndarray, vehicle: Vehicle) -> Steps:
     right = by_right * vehicle.right_radius
     left = by_left * vehicle.left_radius
     dtheta = 2 * (right - left) / vehicle.wheelbase
-    ds_by_w = np.column_stack([by_right, by_left, np.zeros(len(counts))])
-    dtheta_by_w = np.column_stack([2 * by_right, -2 * by_left, -dtheta]) / vehicle.wheelbase
+    ds_by_w = np.array([by_right, by_left, np.zeros(len(counts))]).T
+    dtheta_by_w = np.array([2 * by_right, -2 * by_left, -dtheta]).T / vehicle.wheelbase
     return Steps(right + left, dtheta, ds_by_w, dtheta_by_w)
 
 
@@ -66,7 +66,11 @@ def dead_reckoning(ticks: np.ndarray, vehicle: Vehicle, initial_pose: np.ndarray
     array([[0.   , 0.   , 0.   ],
            [0.628, 0.   , 0.   ]])
     """
-    step = steps(ticks, vehicle)
+    return _integrated(steps(ticks, vehicle), initial_pose, model)
+
+
+def _integrated(step, initial_pose, model="euler"):
+    """Poses (n, 3) by Steps from `initial_pose` (3,)."""
     heading = cumulative(step.dtheta, initial_pose[2])
     bend = _bend(model) * step.dtheta
     direction = heading[:-1] + bend
@@ -97,8 +101,9 @@ def equation2(ticks: np.ndarray, vehicle: Vehicle, initial_pose: np.ndarray = OR
     """
     if initial_covariance is None:
         initial_covariance = _initial_covariance(vehicle)
-    poses = dead_reckoning(ticks, vehicle, initial_pose)
-    J = step_jacobian(ticks, vehicle, poses[:-1, 2])
+    step = steps(ticks, vehicle)
+    poses = _integrated(step, initial_pose)
+    J = step_jacobian(step, poses[:-1, 2])
     by_wheel = cumulative(J[:, :, :3] * vehicle.sigma_wheel)
     variance_heading = initial_covariance[2, 2] + np.sum(by_wheel[:-1, 2]**2, axis=1)
     sigma_heading = np.sqrt(variance_heading)
@@ -107,13 +112,12 @@ def equation2(ticks: np.ndarray, vehicle: Vehicle, initial_pose: np.ndarray = OR
     return poses, initial_covariance + integral @ integral.mT
 
 
-def step_jacobian(ticks: np.ndarray, vehicle: Vehicle, heading: np.ndarray) -> np.ndarray:
-    """Jacobians J_k of equation 2 and equation 3, (n-1, 3, 4).
+def step_jacobian(step: Steps, heading: np.ndarray) -> np.ndarray:
+    """Jacobians J_k of equation 2 and equation 3, (n-1, 3, 4), of Steps.
 
     J_k = d(X_{k+1} - X_k) / d w_k with w_k = [R_R, R_L, b, heading_k]. `heading` (n-1,) is that at
     the start of each Euler step, in rad.
     """
-    step = steps(ticks, vehicle)
     c = np.cos(heading)
     s = np.sin(heading)
     J = np.zeros((len(heading), 3, 4))

@@ -72,16 +72,21 @@ def difference(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return r
 
 
-def compose_jacobians(T_ab: np.ndarray, T_bc: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Derivatives of compose, d T_ac / d T_ab and d T_ac / d T_bc, each (..., 3, 3)."""
-    T_ab = np.asarray(T_ab)
+def compose_with_jacobians(T_ab: np.ndarray, T_bc: np.ndarray) -> tuple[np.ndarray, ...]:
+    """T_ac = T_ab T_bc, (..., 3), and its derivatives by T_ab and T_bc, each (..., 3, 3)."""
+    T_ab = np.asarray(T_ab, dtype=float)
     lever = _turned(T_bc, T_ab[..., 2])                  # position of c from b, in axes of a
     by_first = _identity(lever.shape)
     by_first[..., 0, 2] = -lever[..., 1]
     by_first[..., 1, 2] = lever[..., 0]
     by_second = _identity(lever.shape)
     by_second[..., :2, :2] = rotation(T_ab[..., 2])
-    return by_first, by_second
+    return T_ab + lever, by_first, by_second
+
+
+def compose_jacobians(T_ab: np.ndarray, T_bc: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Derivatives of compose, d T_ac / d T_ab and d T_ac / d T_bc, each (..., 3, 3)."""
+    return compose_with_jacobians(T_ab, T_bc)[1:]
 
 
 def by_left_perturbation(T: np.ndarray) -> np.ndarray:
@@ -92,20 +97,24 @@ def by_left_perturbation(T: np.ndarray) -> np.ndarray:
 def compose_uncertain(T_ab: np.ndarray, C_ab: np.ndarray, T_bc: np.ndarray,
                       C_bc: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """T_ac, (..., 3), and its covariance (..., 3, 3), by independent motions and covariances."""
-    A, B = compose_jacobians(T_ab, T_bc)
-    C_ac = A @ C_ab @ A.mT + B @ C_bc @ B.mT
-    return compose(T_ab, T_bc), C_ac
+    T_ac, A, B = compose_with_jacobians(T_ab, T_bc)
+    return T_ac, A @ C_ab @ A.mT + B @ C_bc @ B.mT
 
 
-def between_jacobians(T_wa: np.ndarray, T_wb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Derivatives of between, d T_ab / d T_wa and d T_ab / d T_wb, each (..., 3, 3)."""
+def between_with_jacobians(T_wa: np.ndarray, T_wb: np.ndarray) -> tuple[np.ndarray, ...]:
+    """T_ab = inverse(T_wa) T_wb, (..., 3), and its derivatives by T_wa and T_wb, (..., 3, 3)."""
     T_ab = between(T_wa, T_wb)
     by_second = _identity(T_ab.shape)
     by_second[..., :2, :2] = rotation(-np.asarray(T_wa)[..., 2])
     by_first = -by_second
     by_first[..., 0, 2] = T_ab[..., 1]
     by_first[..., 1, 2] = -T_ab[..., 0]
-    return by_first, by_second
+    return T_ab, by_first, by_second
+
+
+def between_jacobians(T_wa: np.ndarray, T_wb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Derivatives of between, d T_ab / d T_wa and d T_ab / d T_wb, each (..., 3, 3)."""
+    return between_with_jacobians(T_wa, T_wb)[1:]
 
 
 def log(T: np.ndarray) -> np.ndarray:
@@ -114,23 +123,16 @@ def log(T: np.ndarray) -> np.ndarray:
     It is [a x + h y / 2, -h x / 2 + a y, h] with the wrapped heading h and a = (h / 2) cot(h / 2).
     GTSAM computes the error of its between factors with it (`Pose2::Logmap`).
     """
+    return log_with_jacobian(T)[0]
+
+
+def log_with_jacobian(T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """`log` of motions T (..., 3), and its derivative by [x, y, heading], (..., 3, 3)."""
     T = np.asarray(T, dtype=float)
     x = T[..., 0]
     y = T[..., 1]
     h = wrap(T[..., 2])
-    a = _half_cotangent(h)
-    v_x = a * x + h * y / 2
-    v_y = -h * x / 2 + a * y
-    return _poses(v_x, v_y, h)
-
-
-def log_jacobian(T: np.ndarray) -> np.ndarray:
-    """Derivative of `log` at motions T (..., 3) by [x, y, heading], (..., 3, 3)."""
-    T = np.asarray(T, dtype=float)
-    x = T[..., 0]
-    y = T[..., 1]
-    h = wrap(T[..., 2])
-    a = _half_cotangent(h)
+    a = np.cos(h / 2) / np.sinc(h / (2 * np.pi))             # (h / 2) cot(h / 2)
     small = np.abs(h) < 1e-3                                 # there the derivative of a cancels
     safe = np.where(small, 1.0, h)
     quotient = (a - a**2 - h**2 / 4) / safe
@@ -142,12 +144,7 @@ def log_jacobian(T: np.ndarray) -> np.ndarray:
     jacobian[..., 1, 0] = -h / 2
     jacobian[..., 1, 1] = a
     jacobian[..., 1, 2] = a_by_h * y - x / 2
-    return jacobian
-
-
-def _half_cotangent(h):
-    """(h / 2) cot(h / 2)."""
-    return np.cos(h / 2) / np.sinc(h / (2 * np.pi))
+    return _poses(a * x + h * y / 2, a * y - h * x / 2, h), jacobian
 
 
 def rotate_covariance(covariance: np.ndarray, heading: np.ndarray) -> np.ndarray:
@@ -217,4 +214,4 @@ def _poses(x, y, heading):
 
 def _identity(shape):
     """Identity matrices (..., 3, 3), one for each pose of an array of this shape, (..., 3)."""
-    return np.zeros(shape + (3,)) + np.eye(3)
+    return np.full(shape + (3,), np.eye(3))

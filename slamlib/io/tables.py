@@ -151,12 +151,13 @@ def _table_of_text(path, name):
         notes.add("read without the header line")
     for line in lines:
         cells = cells_of(rows[line])
-        try:
-            row = [float(cell.replace(",", ".") or "nan") for cell in cells]
-        except ValueError:
-            row = []
         if "," in "".join(cells):
             notes.add("read with decimal commas")
+            cells = [cell.replace(",", ".") for cell in cells]
+        try:
+            row = [float(cell or "nan") for cell in cells]
+        except ValueError:
+            row = []
         while len(row) > count and np.isnan(row[-1]):
             row.pop()
         if name == GUESS and len(row) == count + 1:

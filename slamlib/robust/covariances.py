@@ -20,7 +20,7 @@ in the tangent space at the state that solves the problem of greatest posterior 
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_solve_banded, cholesky_banded, solve_triangular
+from scipy.linalg import cholesky_banded, solve_triangular
 from scipy.sparse import csc_array, hstack, vstack
 
 from slamlib.robust.calibration import WHEELS
@@ -81,26 +81,34 @@ def marginal_covariances(equations: NormalEquations, noise: Noise) -> Covariance
 
 @dataclass(frozen=True)
 class _Chain:
-    """The Cholesky decomposition L L^T of T (3 f, 3 f), block tridiagonal, with blocks (3, 3)."""
+    """The decomposition L D L^T of T (3 f, 3 f), block tridiagonal, with blocks (3, 3).
 
-    bands: np.ndarray        # (6, 3 f) diagonals of L, the lower ones below
-    inverse: np.ndarray      # (f, 3, 3) L_ii^-1
-    W: np.ndarray            # (f-1, 3, 3) L_{i+1,i} L_ii^-1
+    L has identities on its diagonal, D is block diagonal.
+    """
+
+    inverse: np.ndarray      # (f, 3, 3) D_ii^-1
+    W: np.ndarray            # (f-1, 3, 3) L_{i+1,i}
 
     def solve(self, b):
         """T^-1 b of b (3 f, w)."""
-        return cho_solve_banded((self.bands, True), b)
+        y = b.reshape(len(self.inverse), 3, -1).copy()
+        for k, W in enumerate(self.W):
+            y[k + 1] -= W @ y[k]
+        x = self.inverse @ y
+        for k in reversed(range(len(self.W))):
+            x[k] -= self.W[k].T @ x[k + 1]
+        return x.reshape(b.shape)
 
     def blocks(self):
         """Blocks of T^-1, (f, 3, 3) on the diagonal and (f-1, 3, 3) above it.
 
         From the last one on they are
 
-            Z_ii = L_ii^-T L_ii^-1 + W^T Z_{i+1,i+1} W,    Z_{i,i+1} = -W^T Z_{i+1,i+1}
+            Z_ii = D_ii^-1 + W^T Z_{i+1,i+1} W,    Z_{i,i+1} = -W^T Z_{i+1,i+1}
 
         (Takahashi, Fagan and Chin, Formation of a sparse bus impedance matrix, PICA 1973).
         """
-        Z = self.inverse.mT @ self.inverse
+        Z = self.inverse.copy()
         for k in reversed(range(len(self.W))):
             Z[k] += self.W[k].T @ Z[k + 1] @ self.W[k]
         Z = (Z + Z.mT) / 2
@@ -110,14 +118,13 @@ class _Chain:
 def _decomposed(T):
     """The _Chain of T (3 f, 3 f)."""
     bands = [np.pad(T.diagonal(-k), (0, k))[:T.shape[0]] for k in range(6)]
-    bands = cholesky_banded(bands, lower=True)
-    L = bands.reshape(6, -1, 3)
+    L = cholesky_banded(bands, lower=True).reshape(6, -1, 3)
     column = np.tile(np.arange(3), (3, 1))
     offset = column.T - column                           # of the row from the column
     diagonal = np.tril(L[np.abs(offset), :, column].transpose(2, 0, 1))
     below = L[3 + offset, :, column].transpose(2, 0, 1)
     inverse = np.linalg.inv(diagonal)
-    return _Chain(bands, inverse, (below @ inverse)[:-1])
+    return _Chain(inverse.mT @ inverse, (below @ inverse)[:-1])
 
 
 def posterior_moments(fit: Fit) -> tuple[State, Covariances, float]:

@@ -172,16 +172,17 @@ def sighting_error(
     and 0. `is_bumped` (m,) is where the camera is elsewhere. The derivatives are (m, 3, 3),
     (m, 3, 3) and (m, 3, 8). GTSAM: BetweenFactorPose2.
     """
-    after = is_bumped[:, None]
-    camera = c[CAMERA] + after * c[BUMP]
+    camera = c[CAMERA]
+    if is_bumped.any():
+        camera = camera + is_bumped[:, None] * c[BUMP]
     unit = [c[SIZE], c[SIZE], 1]
     mounted = se2.compose(motion, camera)                # camera in vehicle
     Y = se2.compose(poses, mounted)
     seen = se2.between(Y, markers)
     h = seen / unit
-    difference = se2.between(z, h)
-    e = se2.log(difference)
-    by_h = se2.log_jacobian(difference) @ se2.between_jacobians(z, h)[1]
+    difference, _, by_expected = se2.between_with_jacobians(z, h)
+    e, J = se2.log_with_jacobian(difference)
+    by_h = J @ by_expected
     is_point = ~as_pose
     e[is_point] = (h - z)[is_point] * [1, 1, 0]
     by_h[is_point] = np.diag([1.0, 1, 0])
@@ -192,7 +193,7 @@ def sighting_error(
     by_Y = -by_seen @ se2.by_left_perturbation(seen)
     by_pose, by_camera, by_lag = _by_sensor(by_Y, mounted, camera, velocity)
     by_size = -by_seen[:, :, :2] @ h[:, :2, None]
-    by_bump = after[:, None] * by_camera
+    by_bump = is_bumped[:, None, None] * by_camera
     return e, by_pose, by_marker, np.concatenate([by_camera, by_size, by_lag, by_bump], axis=2)
 
 
@@ -235,7 +236,7 @@ def _by_sensor(by_Y, mounted, place, velocity):
     """
     by_pose = by_Y @ inverse_adjoint(mounted)
     by_place = by_Y @ inverse_adjoint(place * [0, 0, 1])
-    by_lag = -by_Y @ inverse_adjoint(place) @ velocity[..., None]
+    by_lag = -by_Y @ (inverse_adjoint(place) @ velocity[..., None])
     return by_pose, by_place, by_lag
 
 

@@ -330,13 +330,13 @@ def _predicted(state, odometry, k, Q, memory):
     M = state.x[:, 3:]
     delta = odometry.delta(k, state.x[:, 1])
     D, D_by_delta, D_by_camera = _in_camera(delta, state.x[:, 2])
-    by_X, by_delta = se2.compose_jacobians(X, delta)
-    M_by_D, M_by_M = se2.between_jacobians(D[:, None], M)
+    X_new, by_X, by_delta = se2.compose_with_jacobians(X, delta)
+    M_new, M_by_D, M_by_M = se2.between_with_jacobians(D[:, None], M)
     M_by_D = M_by_D.reshape(len(D), -1, 3)
     L = np.zeros(state.P.shape[:2] + (3,))
     L[:, POSE] = by_delta
     L[:, MARKERS] = M_by_D @ D_by_delta
-    identity = np.tile(np.eye(9), (len(D), 1, 1))
+    identity = np.broadcast_to(np.eye(9), (len(D), 9, 9))
     F = _block_diagonal(identity, M_by_M)
     F[:, POSE, POSE] = by_X
     F[:, :, WHEELS] += L @ odometry.by_w[k]
@@ -344,23 +344,18 @@ def _predicted(state, odometry, k, Q, memory):
     M_before = np.eye(F.shape[1])[MARKERS]
     F = np.concatenate([F, F[:, MARKERS] - memory * M_before], axis=1)
     L = np.concatenate([L, L[:, MARKERS]], axis=1)
-    x = state.x.copy()
-    x[:, 0] = se2.compose(X, delta)
-    x[:, 3:] = se2.between(D[:, None], M)
-    error = se2.difference(state.z, M)
-    expected = x[:, 3:] + memory * error
+    expected = M_new + memory * se2.difference(state.z, M)
     return state._replace(
-        x=np.concatenate([x, expected], axis=1),
+        x=np.concatenate([X_new[:, None], state.x[:, 1:3], M_new, expected], axis=1),
         P=F @ state.P @ F.mT + L @ Q @ L.mT)
 
 
 def _in_camera(delta, camera):
     """D = c^-1 Delta c (h, 3), the motion of the camera, and its derivatives by Delta and c."""
-    moved = se2.compose(delta, camera)
-    moved_by_delta, moved_by_camera = se2.compose_jacobians(delta, camera)
-    D_by_camera, D_by_moved = se2.between_jacobians(camera, moved)
+    moved, moved_by_delta, moved_by_camera = se2.compose_with_jacobians(delta, camera)
+    D, D_by_camera, D_by_moved = se2.between_with_jacobians(camera, moved)
     by_camera = D_by_camera + D_by_moved @ moved_by_camera
-    return se2.between(camera, moved), D_by_moved @ moved_by_delta, by_camera
+    return D, D_by_moved @ moved_by_delta, by_camera
 
 
 def _updated(state, sightings, row, memory, variance):
@@ -375,14 +370,11 @@ def _updated(state, sightings, row, memory, variance):
     new_part = variance * (1 - memory**2)
     C = new_part[:, None] * sightings.C[known]
     state, accepted = _measured(state, number, sightings.z[known], C)
-    index = np.append([0, 1, 2], 3 + number[accepted])
-    rows = _rows(index).ravel()
-    P = state.P[:, rows[:, None], rows]
     z_new = np.tile(sightings.z[new], (len(memory), 1, 1))
     used = np.append(known[accepted], new)
     return state._replace(
-        x=np.concatenate([state.x[:, index], z_new], axis=1),
-        P=_block_diagonal(P, variance[:, None] * sightings.C[new]),
+        x=np.concatenate([state.x, z_new], axis=1),
+        P=_block_diagonal(state.P, variance[:, None] * sightings.C[new]),
         marker=sightings.marker[used],
         z=sightings.z[used])
 
@@ -390,8 +382,9 @@ def _updated(state, sightings, row, memory, variance):
 def _measured(state, number, z, C):
     """The predicted _State after sightings z (m, 3) of markers, and which of them it accepts, (m,).
 
-    With covariances C (h, m, 3, 3). A sighting beyond the gate of the likeliest filter is wrong. It
-    is equally likely by all filters: as one at the gate by the least certain.
+    With covariances C (h, m, 3, 3); it keeps the accepted markers only. A sighting beyond the gate
+    of the likeliest filter is wrong. It is equally likely by all filters: as one at the gate by the
+    least certain.
     """
     expected = 3 + len(state.marker) + number
     rows = _rows(expected)
@@ -404,16 +397,19 @@ def _measured(state, number, z, C):
     cost_of_wrong = np.minimum(by_certain, GATE + log_determinant.max(axis=0))
     cost = cost_of_wrong[:, ~accepted].sum(axis=1)
 
+    index = np.append([0, 1, 2], 3 + number[accepted])
+    kept = _rows(index).ravel()
     H = rows[accepted].ravel()
-    HP = state.P[:, H]
-    S = HP[:, :, H] + _block_diagonal(np.zeros((len(C), 0, 0)), C[:, accepted])
-    innovation = innovation[:, accepted].reshape(len(C), -1)
-    cost += se2.squared_norms(innovation, S) + np.linalg.slogdet(S)[1]
-    gain = np.linalg.solve(S, HP).mT
-    change = np.matvec(gain, innovation)
-    P = state.P - gain @ HP
+    HP = state.P[:, H[:, None], kept]
+    S = state.P[:, H[:, None], H] + _block_diagonal(np.zeros((len(C), 0, 0)), C[:, accepted])
+    innovation = innovation[:, accepted].reshape(len(C), -1, 1)
+    solved = np.linalg.solve(S, np.concatenate([HP, innovation], axis=2))
+    cost += np.sum(innovation * solved[:, :, -1:], axis=(1, 2)) + np.linalg.slogdet(S)[1]
+    gain = solved[:, :, :-1].mT
+    x = state.x[:, index]
+    P = state.P[:, kept[:, None], kept] - gain @ HP
     return state._replace(
-        x=state.x + change.reshape(state.x.shape),
+        x=x + (gain @ innovation).reshape(x.shape),
         P=(P + P.mT) / 2,
         log_density=state.log_density - cost / 2,
         rejected=state.rejected + np.count_nonzero(~accepted)), accepted
@@ -445,9 +441,9 @@ def _poses_from_frames(dataset, jumps, frame, slip, x, P):
     odometry = _odometry(dataset, jumps, frame[last], pose)
     X = x[last, 0]
     delta = odometry.delta(pose, x[last, 1])
-    by_X, by_delta = se2.compose_jacobians(X, delta)
+    poses, by_X, by_delta = se2.compose_with_jacobians(X, delta)
     F = np.concatenate([by_X, by_delta @ odometry.by_w], axis=2)
     Q = odometry.noise(pose, slip)
     by_frame = F @ P[last, :6, :6] @ F.mT
     by_odometry = by_delta @ Q @ by_delta.mT
-    return se2.compose(X, delta), by_frame + by_odometry
+    return poses, by_frame + by_odometry

@@ -159,6 +159,12 @@ class AntennaRanges:
         expected = np.linalg.norm(place - self.positions, axis=1)
         return (expected - self.distance) / self.sigma
 
+    def directions(self, place: np.ndarray) -> np.ndarray:
+        """(m, 2) unit vectors from the tag to a `place` (2,), m."""
+        difference = place - self.positions
+        distance = np.linalg.norm(difference, axis=1)
+        return difference / np.maximum(distance, MIN_DISTANCE)[:, None]
+
 
 def ranges_by_antenna(measurements: Measurements, poses: np.ndarray, covariances: np.ndarray,
                       c: np.ndarray, factor: float = 1.0) -> list[AntennaRanges]:
@@ -173,11 +179,8 @@ def ranges_by_antenna(measurements: Measurements, poses: np.ndarray, covariances
     range_sigma = factor * r.sigma / c[SCALE] * steepness
     position_sigma = np.sqrt(np.trace(covariances[:, :2, :2], axis1=1, axis2=2) / 2)
     sigma = np.hypot(range_sigma, position_sigma[r.row])
-    by_antenna = []
-    for k, guess in enumerate(measurements.guess):
-        rows = np.flatnonzero(r.antenna == k)
-        by_antenna.append(AntennaRanges(tag[rows], plane[rows], sigma[rows], guess))
-    return by_antenna
+    return [AntennaRanges(tag, plane, sigma, guess).select(r.antenna == k)
+            for k, guess in enumerate(measurements.guess)]
 
 
 class Trilateration(NamedTuple):
@@ -228,10 +231,8 @@ def _minimum(ranges, start):
         return np.concatenate([ranges.errors(place), (place - ranges.guess) / GUESS_PRIOR_SIGMA])
 
     def derivatives(place):
-        difference = place - ranges.positions
-        distance = np.maximum(np.linalg.norm(difference, axis=1), MIN_DISTANCE)
-        direction = difference / distance[:, None]
-        return np.concatenate([direction / ranges.sigma[:, None], np.eye(2) / GUESS_PRIOR_SIGMA])
+        by_place = ranges.directions(place) / ranges.sigma[:, None]
+        return np.concatenate([by_place, np.eye(2) / GUESS_PRIOR_SIGMA])
 
     return cauchy_minimum(errors, start, derivatives, KERNEL_SCALE, TOLERANCE)
 

@@ -84,19 +84,18 @@ def cauchy_minimum(errors: Callable, start: np.ndarray, derivatives: Callable, s
     (m, p). It ends where a step lowers the cost by at most `tolerance` times itself.
     """
     def at(x):
-        return x, scale**2 / 2 * np.sum(np.log1p((errors(x) / scale)**2))
+        z = errors(x) / scale
+        return (x, z), scale**2 / 2 * np.sum(np.log1p(z**2))
 
-    x, cost = at(start)
+    (x, z), cost = at(start)
     for _ in range(MAX_STEPS):
-        r = errors(x)
         J = derivatives(x)
-        weight = 1 / (1 + (r / scale)**2)
+        weight = 1 / (1 + z**2)
         weighted = weight * J.T
-        step = -np.linalg.solve(weighted @ J, weighted @ r)
+        step = -scale * np.linalg.solve(weighted @ J, weighted @ z)
         old = cost
-        x, cost = descended(lambda part, x=x, step=step: at(x + part * step), x, old)
+        (x, z), cost = descended(lambda part, x=x, step=step: at(x + part * step), (x, z), old)
         if old - cost <= tolerance * old:
             break
-    z = (errors(x) / scale)**2
-    curvature = np.maximum((1 - z) / (1 + z)**2, np.finfo(float).eps)
+    curvature = np.maximum((1 - z**2) / (1 + z**2)**2, np.finfo(float).eps)
     return Minimum(x, cost, np.sqrt(curvature)[:, None] * derivatives(x))

@@ -16,7 +16,6 @@ from slamlib.core.graph import GUESS_PRIOR_SIGMA
 from slamlib.core.increments import odometry_noise
 from slamlib.robust.calibration import WHEELS, calibration_table
 from slamlib.robust.covariances import posterior_moments
-from slamlib.robust.factors import MIN_DISTANCE
 from slamlib.robust.fit import Fit, error_memories, residuals
 from slamlib.robust.initialization import (
     SAME_PLACE,
@@ -27,7 +26,7 @@ from slamlib.robust.initialization import (
     trilaterate,
 )
 from slamlib.robust.linear import Problem, State
-from slamlib.robust.solution import GtsamSolution, graph_of, solved_noise, values_of
+from slamlib.robust.solution import GtsamSolution, graph_of, places_of, solved_noise, values_of
 
 MIN_ACCEPTED_RANGES = 5      # number of accepted ranges of an antenna that is not in doubt
 SAME_MARKER = 0.05           # m, distance of two markers that must be one
@@ -208,22 +207,15 @@ def _agreement(solution, engine, few_ranges):
     of_antennas = in_both[len(in_both) - len(few_ranges):]
     of_antennas[few_ranges] = False
     sigma = np.sqrt(_variances(engine)[in_both])
-    difference = se2.between(_places(engine), _places(solution))
+    difference = se2.between(places_of(engine.state), places_of(solution.state))
     difference[:, 2] = se2.wrap(difference[:, 2])
     off = np.abs(difference[in_both]) / sigma
     ratio = np.abs(np.sqrt(variances[in_both]) / sigma - 1)
     return float(off.max(initial=0.0)), float(ratio.max(initial=0.0))
 
 
-def _places(solution):
-    """Poses, markers and antennas (f + k + a, 3) of a solution, antennas with heading 0."""
-    state = solution.state
-    antennas = np.pad(state.antennas, ((0, 0), (0, 1)))
-    return np.concatenate([state.poses, state.markers, antennas])
-
-
 def _variances(solution):
-    """Variances (f + k + a, 3) of the same, of poses and markers in their own axes."""
+    """Variances (f + k + a, 3) of a solution, of poses and markers in their own axes."""
     blocks = np.concatenate([solution.frames, solution.landmarks])
     return np.diagonal(blocks, axis1=1, axis2=2)
 
@@ -294,9 +286,7 @@ def worst_sigma(ranges: AntennaRanges, estimate: np.ndarray, weight: np.ndarray)
 
     Its covariance in the world also includes the uncertain heading of pose 1.
     """
-    difference = estimate - ranges.positions
-    distance = np.maximum(np.linalg.norm(difference, axis=1), MIN_DISTANCE)
-    direction = difference / distance[:, None]
+    direction = ranges.directions(estimate)
     weighted = direction * (weight / ranges.sigma**2)[:, None]
     information = np.linalg.eigvalsh(direction.T @ weighted)[0]
     return 1 / np.sqrt(max(information, GUESS_PRIOR_SIGMA**-2))
@@ -326,7 +316,7 @@ def _from_frame(problem, state, row, pose, is_after):
     start, end = (pose, frame) if is_after else (frame, pose)
     motion, motion_by_wheel = increments.between_poses(
         ticks, vehicle, frame, pose, problem.odometry.model)
-    by_frame, by_motion = se2.compose_jacobians(X, motion)
+    at_pose, by_frame, by_motion = se2.compose_with_jacobians(X, motion)
     rounding, slipping = odometry_noise(ticks, vehicle, start, end)
     Q = rounding + problem.noise.slip**2 * slipping          # in the axes of `start`
     by_increment = by_motion
@@ -334,7 +324,7 @@ def _from_frame(problem, state, row, pose, is_after):
         increment = se2.inverse(motion)
         by_increment = by_motion @ se2.between_jacobians(increment, np.zeros(3))[0]
     return _Side(
-        pose=se2.compose(X, motion), by_frame=by_frame, by_wheel=by_motion @ motion_by_wheel,
+        pose=at_pose, by_frame=by_frame, by_wheel=by_motion @ motion_by_wheel,
         noise=by_increment @ Q @ by_increment.mT,
         jump=m.jumps.share(start, end).sum(axis=1)[:, None, None])
 

@@ -329,21 +329,22 @@ def averaged(fit: Fit, graph: gtsam.NonlinearFactorGraph, found: GaussNewton,
     off = [values.zeroVectors()]
     moved = values
     if len(points) > 1:
-        linear = [graph_of(problem, noise).linearize(values) for _, noise in points]
-        solved = [eliminated(each) for each in linear]
+        ordering = gtsam.Ordering.ColamdNonlinearFactorGraph(graph)
+        solved = [eliminated(graph_of(problem, noise).linearize(values), ordering)
+                  for _, noise in points]
         marginals = [Marginals(tree) for tree, _ in solved]
         mean = values.zeroVectors()
         for weight, (_, step) in zip(weights, solved):
             mean = mean.add(step.scale(weight))
         off = [step.subtract(mean) for _, step in solved]
-        _, at_mode = eliminated(graph.linearize(values))
+        _, at_mode = eliminated(graph.linearize(values), ordering)
         moved = values.retract(mean.subtract(at_mode))
 
     def covariance(key, other=None):
         """Block (d, e) of the averaged covariance of one or two variables."""
         total = 0.0
         for weight, marginal, step in zip(weights, marginals, off):
-            spread = np.outer(step.at(key), step.at(other or key))
+            spread = step.at(key)[:, None] * step.at(other or key)
             block = marginal.joint(key, other) if other else marginal.covariance(key)
             total = total + weight * (block + spread)
         return total
