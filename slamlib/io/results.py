@@ -10,7 +10,7 @@ from io import BytesIO
 from pathlib import Path
 
 import numpy as np
-from scipy.io import savemat
+from scipy.io import loadmat, savemat
 
 from slamlib.core.errors import require
 from slamlib.io.files import write_file
@@ -54,7 +54,7 @@ def read_summary(folder: Path | str) -> dict:
 
 
 def read_structs(folder: Path | str, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Ids (n,), poses (n, 3) or positions (n, 2), and covariances of a file of `write_structs`.
+    """Ids (n,), poses (n, 3) or positions (n, 2), and covariances of a file in a folder.
 
     `name` is a key of FIELDS. The ids of vehicle poses are 1 to n.
 
@@ -63,26 +63,14 @@ def read_structs(folder: Path | str, name: str) -> tuple[np.ndarray, np.ndarray,
     >>> ids.tolist(), poses.shape, covariances.shape
     ([1, 2], (2, 3), (2, 3, 3))
     """
-    content = (Path(folder) / f"{name}.mat").read_bytes()
-    layout = _layout(name)
-    count = np.frombuffer(content, "=i4", COUNT_WORD + 1)[COUNT_WORD]
-    structs = np.frombuffer(content[-count * layout.itemsize:], layout)
+    file = Path(folder) / f"{name}.mat"
+    structs = loadmat(file)[name].ravel()
     place, covariance, *label = FIELDS[name]
-    ids = np.arange(1, count + 1)
+    places = np.concatenate(structs[place])
+    ids = np.arange(1, len(places) + 1)
     if label:
-        ids = structs["id"].ravel().astype(int)
-    return ids, structs[place][:, :, 0].copy(), structs[covariance].mT.copy()
-
-
-def _layout(name):
-    """The dtype of a struct of a file: of each field a header and its numbers, by columns."""
-    place, covariance, *label = FIELDS[name]
-    d = 2 if name == "UwbMap" else 3
-    shapes = {place: (d, 1), covariance: (d, d)} | dict.fromkeys(label, (1, 1))
-    entries = []
-    for field, shape in shapes.items():
-        entries += [(f"header of {field}", FIELD_HEADER), (field, "=f8", shape)]
-    return np.dtype(entries)
+        ids = np.concatenate(structs["id"]).ravel().astype(int)
+    return ids, places, np.stack(structs[covariance])
 
 
 def write_structs(folder: Path | str, name: str, ids: np.ndarray | None, places: np.ndarray,
@@ -93,21 +81,27 @@ def write_structs(folder: Path | str, name: str, ids: np.ndarray | None, places:
     `places` are poses (n, 3), of markers with headings in (-pi, pi], or positions (n, 2);
     `covariances` are (n, 3, 3) or (n, 2, 2). They are NaN where there is no estimate.
 
-    scipy writes and reads many structs slowly, one by one. Here it writes one of zeros, whose bytes
-    are repeated with the numbers. The array's size and number of columns are set (MAT-File Format,
-    version 5).
+    scipy writes many structs slowly, one by one. Here it writes one of zeros, whose bytes are
+    repeated with the numbers: each field is a header of 56 bytes and its numbers by columns. The
+    array's size and number of columns are set (MAT-File Format, version 5).
     """
-    count = len(places)
-    layout = _layout(name)
-    zeros = {field: np.zeros(layout[field].shape[::-1]) for field in FIELDS[name]}
+    count, d = np.shape(places)
+    zeros = {}
+    numbers = {}
+    entries = []
+    for field, values, shape in zip(
+            FIELDS[name], (places, covariances, ids), ((1, d), (d, d), (1, 1))):
+        zeros[field] = np.zeros(shape)
+        numbers[field] = np.reshape(values, (count, *shape))
+        entries += [(f"header of {field}", FIELD_HEADER), (field, "=f8", shape[::-1])]  # by columns
+    layout = np.dtype(entries)
     buffer = BytesIO()
     savemat(buffer, {name: zeros})
     content = bytearray(buffer.getvalue())
     content[:len(_HEADER)] = _HEADER
     structs = np.repeat(np.frombuffer(content[-layout.itemsize:], layout), count)
-    for field, values in zip(FIELDS[name], (places, covariances, ids)):
-        numbers = structs[field].mT
-        numbers[:] = np.reshape(values, numbers.shape)
+    for field, values in numbers.items():
+        structs[field] = np.swapaxes(values, 1, 2)
     words = np.frombuffer(content, "=i4", COUNT_WORD + 1)
     words[SIZE_WORD] += (count - 1) * layout.itemsize
     words[COUNT_WORD] = count
