@@ -54,8 +54,7 @@ def read_text(path: Path) -> str:
 def read_rows(path: Path) -> dict[int, str]:
     """Rows of a file by their line, from 1, without comments, quotes, and rows without words."""
     text = re.sub(_COMMENT_OR_QUOTE, "", read_text(path))
-    if "," in text or ";" in text:
-        text = re.sub(_BLANKS_AT_SEPARATOR, "", text)
+    text = re.sub(_BLANKS_AT_SEPARATOR, "", text)
     rows = enumerate(text.split("\n"), start=1)
     return {line: row.strip() for line, row in rows if row.strip(" \t,;")}
 
