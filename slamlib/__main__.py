@@ -108,8 +108,7 @@ def _told(summaries):
     """The exit code by the summaries of drives, after printing a table, what failed and doubts."""
     from slamlib.solve import COLUMNS, drive_rows
     rows = drive_rows(summaries)
-    known = [name for name in COLUMNS
-             if name != "failed" and any(row.get(name) is not None for row in rows)]
+    known = [name for name in COLUMNS[:-1] if any(row.get(name) is not None for row in rows)]
     table = [known] + [[_cell(row.get(name)) for name in known] for row in rows]
     widths = [max(map(len, column)) for column in zip(*table)]
     for cells in table:
