@@ -106,13 +106,9 @@ def _build(options):
 
 def _told(summaries):
     """The exit code by the summaries of drives, after printing a table, what failed and doubts."""
-    from slamlib.solve import COLUMNS, drive_rows
-    rows = drive_rows(summaries)
-    known = [name for name in COLUMNS[:-1] if any(row.get(name) is not None for row in rows)]
-    table = [known] + [[_cell(row.get(name)) for name in known] for row in rows]
-    widths = [max(map(len, column)) for column in zip(*table)]
-    for cells in table:
-        print(" ".join(cell.rjust(width) for cell, width in zip(cells, widths)))
+    from slamlib.solve import drive_table
+    table = drive_table(summaries).drop(columns="failed").dropna(axis=1, how="all")
+    print(table.to_string(index=False, na_rep="-", float_format="{:.4g}".format))
     code = 0
     for summary in summaries:
         name = summary["dataset"]
@@ -126,13 +122,6 @@ def _told(summaries):
         if "error" in summary:
             code = _ended(2, summary["error"])
     return code
-
-
-def _cell(value):
-    """A number to four digits, a text as it is, or a dash."""
-    if value is None:
-        return "-"
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def _solve(options):

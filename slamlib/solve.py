@@ -5,13 +5,11 @@ plain numbers. `solve_to_folder` does so for all problems of a dataset, `solve_f
 datasets.
 """
 
-import csv
 import sys
 import time
 from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
-from io import StringIO
 from os.path import abspath
 from pathlib import Path
 from typing import NamedTuple
@@ -407,19 +405,18 @@ def solve_folders(folders: Sequence[Path], out: Path | str, jobs: int | None = N
 
     summaries = Parallel(n_jobs=jobs)(
         delayed(solve)(name, folder) for name, folder in by_name.items())
-    text = StringIO()
-    table = csv.DictWriter(text, COLUMNS, extrasaction="ignore", lineterminator="\n")
-    table.writeheader()
-    table.writerows(drive_rows(summaries))
-    files.write_file(out / "drives.csv", text.getvalue().encode())
+    table = drive_table(summaries).to_csv(index=False)
+    files.write_file(out / "drives.csv", table.encode())
     return summaries
 
 
-def drive_rows(summaries: Sequence[dict]) -> list[dict]:
-    """The rows over all drives, of `solve_folders`: one for each problem, with those of COLUMNS.
+def drive_table(summaries: Sequence[dict]):
+    """The DataFrame over all drives, of `solve_folders`: a row for each problem, with COLUMNS.
 
-    A problem or a drive that failed has a sentence; what is not known is absent or None.
+    A problem or a drive that failed has a sentence; what is not known is NaN.
     """
+    import pandas  # here, because it is the slowest import of all
+
     rows = []
     for summary in summaries:
         drive = {"dataset": summary["dataset"], "failed": summary.get("error")}
@@ -427,4 +424,4 @@ def drive_rows(summaries: Sequence[dict]) -> list[dict]:
             rows.append(drive | row | {"problem": problem, "doubts": len(row["doubts"])})
         if not summary["problems"]:
             rows.append(drive)
-    return rows
+    return pandas.DataFrame(rows, columns=COLUMNS)
