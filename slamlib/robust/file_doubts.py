@@ -25,6 +25,7 @@ from slamlib.robust.part_faults import (
     later_delay,
     moving_increments,
     other_axes,
+    with_headings_reversed,
     with_wheels_mended,
 )
 
@@ -96,14 +97,15 @@ def motion_doubts(dataset: Dataset) -> list[Doubt]:
     markers, wheels, sigma, poses = moving_increments(dataset)
     if len(wheels) < MIN_COUNT:
         return []
-    off = contradictions(markers, wheels @ MOTIONS, sigma)
+    with_both_signs = np.stack([markers, with_headings_reversed(dataset)])
+    off = contradictions(with_both_signs, wheels @ MOTIONS, sigma)
     dead = ~dataset.ticks.any(axis=0)
     if dead.any() and np.mean(off[0, 0] < 1) < MIN_AGREEING_SHARE:
         return [_dead_doubt(dead)]
     stretch = other_axes(off, poses)
     if stretch is not None:
         return [_axes_doubt(stretch, stretch.is_mended(len(dataset.ticks)))]
-    return list(wrong_sizes(markers[0], wheels, sigma, off[0, 0] < 1))
+    return list(wrong_sizes(markers, wheels, sigma, off[0, 0] < 1))
 
 
 def _dead_doubt(dead):

@@ -77,32 +77,41 @@ REVERSED = (2, 3)
 
 @lru_cache(maxsize=2)
 def moving_increments(
-        dataset: Dataset, signs: tuple[int, ...] = (1, -1)
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        dataset: Dataset) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Increments of the moving vehicle between n pairs of frames about SPAN apart.
 
-    Returns those by markers (len(signs), n, 3), with theta multiplied by each of the `signs`, by
-    wheels (n, 3), the standard deviations of distance and turn by markers (n, 2), and the encoder
-    poses of each pair of frames (n, 2), from 0.
+    Returns those by markers (n, 3) and by wheels (n, 3), the standard deviations of distance and
+    turn by markers (n, 2), and the encoder poses of each pair of frames (n, 2), from 0.
+    """
+    s, common, wheels, poses = _compared(dataset)
+    by_markers = robust_increments(s.z, s.C, *common, len(wheels))
+    sigma = distance_and_turn_sigmas(by_markers.covariance)
+    size = np.maximum(distance_and_turn(by_markers.increment), distance_and_turn(wheels))
+    moving = by_markers.usable & (size > MIN_MOTION_SIGMAS * sigma).any(axis=1)
+    return by_markers.increment[moving], wheels[moving], sigma[moving], poses[moving]
+
+
+def with_headings_reversed(dataset: Dataset) -> np.ndarray:
+    """The increments by markers (n, 3) of `moving_increments`, for theta of the opposite sign."""
+    s, common, wheels, poses = _compared(dataset)
+    mirror = np.diag([1.0, 1.0, -1.0])
+    by_markers = robust_increments(s.z @ mirror, mirror @ s.C @ mirror, *common, len(wheels))
+    moving = np.isin(poses[:, 0], moving_increments(dataset)[3][:, 0])
+    return by_markers.increment[moving]
+
+
+def _compared(dataset):
+    """Sightings, and what `robust_increments` needs of them, for all pairs of frames.
+
+    Also the increments by wheels between each pair, and its encoder poses.
     """
     s = sightings_by_frame(dataset.sightings)
     path = odometry.dead_reckoning(dataset.ticks, dataset.vehicle, model="arc")[s.frame]
     span = _span(path)
-    wheels = se2.between(path[:-span], path[span:])
     common = np.array(common_sightings(s.row, s.marker, span))
     overlapping = common[:, common[0] % max(1, span // OVERLAP) == 0]
-    by_markers = []
-    for sign in signs:
-        mirror = np.diag([1.0, 1.0, sign])
-        by_markers.append(robust_increments(
-            s.z @ mirror, mirror @ s.C @ mirror, *overlapping, len(wheels)))
-    stated = by_markers[0]
-    sigma = distance_and_turn_sigmas(stated.covariance)
-    size = np.maximum(distance_and_turn(stated.increment), distance_and_turn(wheels))
-    moving = stated.usable & (size > MIN_MOTION_SIGMAS * sigma).any(axis=1)
-    markers = np.stack([found.increment for found in by_markers])
     poses = np.column_stack([s.frame[:-span], s.frame[span:]])
-    return markers[:, moving], wheels[moving], sigma[moving], poses[moving]
+    return s, overlapping, se2.between(path[:-span], path[span:]), poses
 
 
 def with_wheels_mended(dataset: Dataset) -> Dataset:
@@ -111,10 +120,10 @@ def with_wheels_mended(dataset: Dataset) -> Dataset:
     It is as it was where that is most of the drive: then the camera may as well have other axes. Of
     all ends of the stretch nearby, the increments agree best with the one that is chosen.
     """
-    markers, wheels, sigma, poses = moving_increments(dataset, signs=(1,))
+    markers, wheels, sigma, poses = moving_increments(dataset)
     if len(wheels) < MIN_COUNT:
         return dataset
-    stretch = other_axes(contradictions(markers, wheels @ MOTIONS, sigma), poses)
+    stretch = other_axes(contradictions(markers[None], wheels @ MOTIONS, sigma), poses)
     if stretch is None or not stretch.is_mended(len(dataset.ticks)):
         return dataset
 
@@ -122,7 +131,7 @@ def with_wheels_mended(dataset: Dataset) -> Dataset:
         """What still contradicts the markers."""
         path = odometry.dead_reckoning(changed.ticks, changed.vehicle, model="arc")
         by_wheels = se2.between(path[poses[:, 0]], path[poses[:, 1]])
-        return _limited(contradictions(markers[0], by_wheels, sigma)).sum()
+        return _limited(contradictions(markers, by_wheels, sigma)).sum()
 
     first = stretch.first
     last = stretch.last
@@ -251,10 +260,10 @@ def camera_bump(dataset: Dataset) -> CameraBump | None:
 
     The moment is that step in the neighbourhood in which markers move most as the camera does.
     """
-    markers, wheels, sigma, poses = moving_increments(dataset, signs=(1,))
+    markers, wheels, sigma, poses = moving_increments(dataset)
     if len(wheels) <= 2 * MIN_COUNT:
         return None
-    k, before, after, gain = _change(markers[0], wheels, sigma, _by_camera(wheels))
+    k, before, after, gain = _change(markers, wheels, sigma, _by_camera(wheels))
     motion = after - before
     if gain < MIN_BUMP_GAIN or np.abs(motion).max() > MAX_BUMP:
         return None
@@ -292,10 +301,11 @@ class LaterDelay(NamedTuple):
         return replace(dataset, aruco=in_order)
 
 
+@lru_cache(maxsize=2)
 def later_delay(dataset: Dataset) -> LaterDelay | None:
     """The LaterDelay of a Dataset, or None if the camera's place explains the sightings as well."""
-    markers, wheels, sigma, poses = moving_increments(dataset, signs=(1,))
-    if not _agree_mostly(markers[0], wheels, sigma):
+    markers, wheels, sigma, poses = moving_increments(dataset)
+    if not _agree_mostly(markers, wheels, sigma):
         return None
     path = odometry.dead_reckoning(dataset.ticks, dataset.vehicle, model="arc")
     increments_late_by = partial(_late_increments, path, poses)
@@ -306,7 +316,7 @@ def later_delay(dataset: Dataset) -> LaterDelay | None:
         by_delay = DELAY_UNIT * by_step[:, :2, None]
         return np.concatenate([_by_camera(increments_late_by(late)), by_delay], axis=2)
 
-    k, before, after, _ = _change(markers[0], wheels, sigma, by_camera_and_delay(0))
+    k, before, after, _ = _change(markers, wheels, sigma, by_camera_and_delay(0))
     first = round(DELAY_UNIT * before[3])
     steps = round(DELAY_UNIT * after[3]) - first
     if steps == 0:
@@ -315,12 +325,13 @@ def later_delay(dataset: Dataset) -> LaterDelay | None:
     def cost(delay):
         """Squared residuals, each up to a limit, if it is mended and nothing else changes."""
         late = first + np.where(poses >= delay.pose, delay.steps, 0)
-        return _cost(markers[0], increments_late_by(late), sigma, by_camera_and_delay(late))
+        return _cost(markers, increments_late_by(late), sigma, by_camera_and_delay(late))
 
     near = np.unique(poses[max(k - 2 * OVERLAP, 0):k + 2 * OVERLAP])
-    delays = {steps - 1, steps, steps + 1} - {0}
-    tried = [LaterDelay(int(pose), each) for pose in near for each in delays]
-    found = min(tried, key=cost)
+    at_each = [LaterDelay(int(pose), steps) for pose in near]
+    found = min(at_each, key=cost)
+    by_one = [found._replace(steps=each) for each in {steps - 1, steps + 1} - {0}]
+    found = min([found, *by_one], key=cost)
     without = cost(found._replace(steps=0))
     if cost(found) > min(MAX_DELAY_COST * without, without - MIN_DELAY_GAIN * OVERLAP):
         return None
@@ -329,19 +340,20 @@ def later_delay(dataset: Dataset) -> LaterDelay | None:
     return found
 
 
+@lru_cache(maxsize=2)
 def constant_delay(dataset: Dataset) -> int:
     """Encoder steps by which all sightings are later than stated, 0 if it is not decidedly so."""
-    markers, wheels, sigma, poses = moving_increments(dataset, signs=(1,))
+    markers, wheels, sigma, poses = moving_increments(dataset)
     if not len(wheels):
         return 0
     path = odometry.dead_reckoning(dataset.ticks, dataset.vehicle, model="arc")
     cost = {}
     for steps in DELAYS:
         late = _late_increments(path, poses, steps)
-        cost[steps] = _cost(markers[0], late, sigma, _by_camera(late))
+        cost[steps] = _cost(markers, late, sigma, _by_camera(late))
     best = min(cost, key=cost.get)
     late = _late_increments(path, poses, best)
-    if cost[best] > MAX_DELAY_COST * cost[0] or not _agree_mostly(markers[0], late, sigma):
+    if cost[best] > MAX_DELAY_COST * cost[0] or not _agree_mostly(markers, late, sigma):
         return 0
     log.info("sightings: %d steps later than stated", best)
     return best
@@ -454,14 +466,14 @@ def _least_squares(information, right, sigma=BUMP_SIGMA):
 def slipping_rows(dataset: Dataset) -> np.ndarray:
     """Rows of counts (n,), bool, in a stretch in which both wheels seem to have other radii."""
     rows = np.zeros(len(dataset.ticks), bool)
-    markers, wheels, sigma, poses = moving_increments(dataset, signs=(1,))
+    markers, wheels, sigma, poses = moving_increments(dataset)
     if len(wheels) <= 2 * MIN_COUNT:
         return rows
     vehicle = dataset.vehicle
     _, by_wheel = increments.between_poses(dataset.ticks, vehicle, *poses.T, "arc")
     by_radii = by_wheel[:, :, :2] * vehicle.wheel[:2]
     variance = sigma[:, [0, 0, 1]]**2 / [2, 2, 1]
-    stretch = _other_radii(se2.difference(markers[0], wheels), by_radii, variance)
+    stretch = _other_radii(se2.difference(markers, wheels), by_radii, variance)
     if stretch is not None:
         first, last = stretch
         rows[poses[first, 0] + 1:poses[last, 1] + 1] = True
