@@ -160,6 +160,8 @@ def test_explanations_that_exclude_each_other_are_all_named(found):
     assert "instead" not in of_tag.sentence
     doubt, = solution_doubts(explained(found, [wheels], [size], [tag], by="marker_size"))
     assert "instead be one factor on both wheels or the place of the UWB tag" in doubt.sentence
+    doubt, = solution_doubts(explained(found, ["wheel-radii"], [wheels]))     # equally far off
+    assert doubt.what == wheels
 
 
 @pytest.mark.parametrize("column, name, file", [
