@@ -50,7 +50,7 @@ PROBLEMS = {
     "problem3": Task("SLAM: odometry + ArUco", "aruco", "slam"),
     "problem4": Task("SLAM with UWB ranges", "uwb", "slam_uwb"),
 }
-SENSORS = {"aruco": "markers", "uwb": "UWB ranges"}
+SENSORS = {"aruco": "markers", "uwb": "UWB ranges to antennas with a guess"}
 VEHICLE_ESTIMATED = "vehicle.toml"                  # in the results: what the drive says of it
 NOISE = {"slip": "slip_sqrt_m", "marker_noise_factor": "marker_noise_factor",
          "range_noise_factor": "range_noise_factor"}    # entries of vehicle.toml, keys of facts
@@ -424,4 +424,4 @@ def drive_table(summaries: Sequence[dict]):
             rows.append(drive | row | {"problem": problem, "doubts": len(row["doubts"])})
         if not summary["problems"]:
             rows.append(drive)
-    return pandas.DataFrame(rows, columns=COLUMNS)
+    return pandas.DataFrame(rows, columns=COLUMNS).convert_dtypes()

@@ -33,6 +33,7 @@ from slamlib.robust.calibration import (
     SIGHTING_LAG,
     SIZE,
     TAG_PLACE,
+    WHEEL_SCALE,
 )
 from slamlib.robust.factors import SMOOTHED_STEPS, sensor_poses
 from slamlib.robust.file_doubts import common_divisor, doubts_before_solving

@@ -105,7 +105,7 @@ def test_selected_drives_are_shown_the_recorded_ones_first(data, monkeypatch):
 
 def test_where_no_drive_has_the_sensor_it_is_said(data, monkeypatch):
     monkeypatch.setenv("SLAMLIB_DATASETS", "wheels")
-    with pytest.raises(DatasetError, match="expected a dataset with UWB ranges, found none"):
+    with pytest.raises(DatasetError, match="UWB ranges to antennas with a guess, found none"):
         start("uwb")
 
 

@@ -147,7 +147,7 @@ def test_every_group_is_named_with_its_entries_and_no_others(found, group):
 
 def test_numbers_are_given_with_standard_deviations_and_units(found):
     doubt, = solution_doubts(explained(found, ["camera-offset"], by="camera_x", off=0.02))
-    assert "By the drive camera_x = 0.02 ± 0.001 m (stated: 0); problem 4" in doubt.sentence
+    assert "By the drive camera_x = 0.0200 ± 0.0010 m (stated: 0); problem 4" in doubt.sentence
 
 
 def test_explanations_that_exclude_each_other_are_all_named(found):

@@ -125,7 +125,7 @@ def test_doubts_notes_and_failures_are_in_the_readme():
                  "d/problem2 (ArUco) is not here: it needs markers.",
                  "d/problem3 (problem3) could not be solved: no landmark.",
                  "d/problem2_hint (problem2_hint) could not be solved: not told.",
-                 "/problem4 (SLAM with UWB ranges) is not here: it needs UWB ranges."):
+                 "/problem4 (SLAM with UWB ranges) is not here: it needs UWB ranges to antennas"):
         assert part in text
     assert text.startswith(f"{Options().title} A C ")
 

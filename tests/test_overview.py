@@ -73,7 +73,7 @@ def test_sensors_that_a_drive_lacks_are_named_and_their_problems_have_no_rows(pr
     assert "| --- | --- | ---: | ---: | ---: | ---: | ---: |" in text
     assert rows["wheels_only", "odometry"][-1] == "1,000"
     assert "There are no markers in wheels_only" in text
-    assert "There are no UWB ranges in wheels_only" in text
+    assert "There are no UWB ranges to antennas with a guess in wheels_only" in text
     known = [drive for drive in project.drives if drive.truth is not None]
     assert "A dash stands" not in result_rows(overview.opening(known))[1]
 
@@ -112,7 +112,7 @@ def test_doubts_failures_and_notes_stand_on_the_first_page(project):
 def test_recorded_drives_are_the_subject_beside_longer_simulated_ones(project):
     simulated, recorded = project.drives[:2]
     mine = replace(recorded, name="mine", dataset=recorded.dataset.first(999))
-    assert "Figure 1. *mine*, the longest drive." in overview.opening(
+    assert "Figure 1. *mine*. Left" in overview.opening(
         [mine, simulated]).cells[0].source
 
 

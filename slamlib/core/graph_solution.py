@@ -141,8 +141,7 @@ def solve_graph(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> Grap
     if worst:
         LOG.warning(worst)
     if not found.converged:
-        LOG.warning("the error still falls after %d steps, to %.4g, or no step lowers it: is a "
-                    "factor far from the rest, a derivative wrong, or an initial value?",
+        LOG.warning("the error still falls after %d steps, to %.4g, or no step lowers it",
                     found.steps, found.error)
     return GraphSolution(
         graph=graph, values=found.values, marginals=found.marginals,

@@ -105,7 +105,10 @@ def _calibration_doubts(result):
 
 def _estimated_and_stated(row):
     """An entry of the calibration in words, by its row of `calibration_table`."""
-    estimated = f"{row['name']} = {row['estimate']:.4g} ± {row['sigma']:.2g} {row['unit']}"
+    sigma = row["sigma"]
+    decimals = max(0, 1 - int(np.floor(np.log10(sigma))))            # two digits of the sigma
+    estimated = (f"{row['name']} = {row['estimate']:.{decimals}f} ± {sigma:.{decimals}f} "
+                 f"{row['unit']}")
     stated = f"{row['stated']:.4g}"
     if row["stated_sigma"]:
         stated += f" ± {row['stated_sigma']:.2g}"
