@@ -143,6 +143,7 @@ def errors(axes: Sequence[Axes], result, drive, role: str = "slam", label: str =
                         label=f"{label} 95 % by the covariance".strip())
         ax.set_ylabel(name)
         ax.yaxis.set_major_formatter(EngFormatter(unit))
+        ax.locator_params("y", nbins=3)
     if found.true is not None:
         error = se2.difference(found.poses, found.true)[some]
         distance = np.hypot(error[:, 0], error[:, 1])
