@@ -78,13 +78,13 @@ def test_derivatives_by_delays_are_averaged_over_encoder_steps():
 
 
 def test_sensors_are_where_the_vehicle_was_by_their_delay():
-    """On the path of odometry, a camera that is four and a tag that is seven encoder steps late."""
+    """On the path of odometry, a camera that is one encoder step and a tag that is seven late."""
     m = measure(short(4, 400)[0])
     path = dead_reckoning(m.dataset.ticks, m.dataset.vehicle, model="arc")
     c = calibration.stated_calibration(
-        replace(MOUNTED, sighting_lag=4, range_lag=7), []).stated
+        replace(MOUNTED, sighting_lag=1, range_lag=7), []).stated
     camera, tag = sensor_poses(m, path[m.frame], c)
-    for found, row, late, place in ((camera, m.sightings.row, 4, [0.15, -0.08, 0.3]),
+    for found, row, late, place in ((camera, m.sightings.row, 1, [0.15, -0.08, 0.3]),
                                     (tag, m.ranges.row, 7, [0.2, -0.1, 0])):
         seen = m.frame[row]
         expected = se2.compose(path[seen[seen >= late] - late], place)

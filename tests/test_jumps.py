@@ -28,8 +28,11 @@ from slamlib.core.evaluation import ate
 from slamlib.core.odometry import dead_reckoning
 from slamlib.core.records import Dataset
 from slamlib.robust import jumps
+from slamlib.robust.choices import with_stretched
 from slamlib.robust.factors import odometry_error, preintegrate_odometry
 from slamlib.robust.fused import fuse
+from slamlib.robust.initialization import odometry_state
+from slamlib.robust.linear import build_problem
 from slamlib.robust.measurements import measure
 from slamlib.robust.solution_doubts import _encoder_doubts, solution_doubts
 from slamlib.studies.simulation import TABLE_2, manoeuvre, simulate
@@ -66,6 +69,21 @@ def test_a_jump_of_a_vehicle_that_stands_is_found_where_it_is():
     assert_allclose(found.by_odometry, 0)
     assert_allclose(found.sigma, [[0.5, 0.5, 0.5], [0.6, 0.6, 0.1]], atol=1e-6)
     assert_allclose(found.mended(np.arange(12), np.zeros((12, 3))), poses, atol=1e-6)
+
+
+def test_a_step_that_stretches_odometry_is_one_more_jump():
+    """The larger one of two; none while poses are those by odometry."""
+    poses = np.zeros((12, 3))
+    problem = build_problem(measure(seen(poses)), "arc")
+    state = odometry_state(problem.measurements, "arc")
+    assert with_stretched(SimpleNamespace(problem=problem, state=state)) is None
+    poses[4:, :2] = [0.4, 0.3]
+    poses[9:, :2] = [0.4, 0.4]
+    state = replace(state, poses=poses)
+    found = with_stretched(SimpleNamespace(problem=problem, state=state))
+    assert found.start.tolist() == [3] and found.end.tolist() == [4]
+    assert_allclose(found.increment, [[0.4, 0.3, 0]])
+    assert_allclose(found.by_odometry, 0)
 
 
 @pytest.mark.parametrize("contradicted, dead", [([3], []), ([2, 3, 7], [1, 2, 3, 4, 5, 6, 7])])

@@ -283,6 +283,7 @@ def test_the_hint_fuses_by_information(propagation):
     delta = C @ (information[0] @ poses[-1] + information[1] @ marker.poses[1])
     assert_allclose(fused.poses[10], delta, atol=1e-9)
     assert_allclose(fused.covariances[10], C, atol=1e-6 * np.abs(C).max())
+    assert fused.covariances[0, 2, 2] == 1e-9**2
     # From there on odometry goes on alone, restarted.
     expected = propagation(dataset.ticks[10:], sure, fused.poses[10], fused.covariances[10])
     assert_allclose(fused.poses[10:], expected[0], atol=1e-12)

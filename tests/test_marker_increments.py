@@ -141,8 +141,8 @@ def test_repeated_sightings_are_averaged_or_dropped():
 
 
 def test_covariances_that_are_nearly_singular_are_increased_by_hand():
-    """Given y, the standard deviation of x is sigma sqrt(1 - rho^2): 1.4e-5, 1.4e-7 and 0.14 m."""
-    for lack, sigma, added in ((1e-6, 0.01, 0), (1e-10, 0.01, 1e-12), (1e-10, 1e4, 0)):
+    """Given y, the standard deviation of x is sigma sqrt(1 - rho^2): 8.9e-6, 1.4e-7 and 0.14 m."""
+    for lack, sigma, added in ((4e-7, 0.01, 0), (1e-10, 0.01, 1e-12), (1e-10, 1e4, 0)):
         C = np.diag([sigma**2, sigma**2, 1e-4])
         C[0, 1] = C[1, 0] = (1 - lack) * sigma**2
         difference = regularized(C[None])[0] - C

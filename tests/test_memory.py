@@ -46,10 +46,11 @@ def test_shares_by_hand():
     rho = np.array([np.mean(of[:, lag:] * of[:, :-lag]) for lag in (1, 2)])
     rho += max(0, 1 - np.mean(of**2))
     assert rho[0] > 0.3 and rho[1] < 0.05
-    share = error_memory(landmark, pose, u, used).share.reshape(LANDMARKS, EACH)
-    assert_allclose(share[:, 0], 1)
-    assert_allclose(share[:, [1, -1]], 1 / (1 + rho[0]))
-    assert_allclose(share[:, 2:-1], 1 / (1 + 2 * rho[0]))
+    for each in (pose, pose // 10):          # also where every pose has a measurement
+        share = error_memory(landmark, each, u, used).share.reshape(LANDMARKS, EACH)
+        assert_allclose(share[:, 0], 1)
+        assert_allclose(share[:, [1, -1]], 1 / (1 + rho[0]))
+        assert_allclose(share[:, 2:-1], 1 / (1 + 2 * rho[0]))
 
 
 def test_memory_is_told_and_counted():
