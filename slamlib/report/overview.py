@@ -114,7 +114,7 @@ def differences_at_returns(drive: SolvedDrive) -> dict[str, float]:
 @plt.style.context(plotting.STYLE, after_reset=True)
 def trajectories(drive: SolvedDrive) -> str:
     """Return the figure of a drive's trajectories, its last map and sigmas, as SVG."""
-    fig = Figure(figsize=(7.2, 3.1))  # inches
+    fig = Figure(figsize=(7.2, 2.6))  # inches
     left, right = fig.subplots(1, 2, width_ratios=(2, 3))
     last = drive.solutions[-1]
     for name, role, size in (("ArucoMap", "marker", 1), ("UwbMap", "antenna", 5)):
