@@ -52,9 +52,10 @@ from slamlib.robust.result import slam_result
 log = logging.getLogger(__name__)
 
 DECISIVE_LEAD = 3.0          # log evidence by which another model of the steps replaces the default
-DECISIVE_RELEASE = 6.0       # log evidence by which a group is told, or an explanation ruled out
+DECISIVE_RELEASE = 6.0       # log evidence by which a group is told to be wrong
 FURTHER_ENTRY = 0.5          # log evidence beside it, for each entry of a group but the first
 STATED = 3.0                 # log evidence beside it, if standard deviations are stated
+AMBIGUOUS = 3.0              # log evidence within which explanations cannot be told apart
 MAX_GROUPS = 5               # number of groups that are wrong at once
 MAX_WIDE_SIGMAS = 4.0        # wide sigmas, of an entry; beyond them a statement is grossly wrong
 GROSS = 10.0                 # factor on the wide sigmas beyond MAX_WIDE_SIGMAS
@@ -253,9 +254,9 @@ class _Sets(NamedTuple):
 def _proposal(fit):
     """The _Proposal of the groups of the calibration of a Fit that the evidence wants released.
 
-    `explanations` are the best set of groups and others that come within DECISIVE_RELEASE of it,
-    neither part of it nor more: the drive cannot tell them apart. Each of their groups must raise
-    the log evidence by its `_price`. The prior releases the groups of all explanations, and what
+    `explanations` are the best set of groups and others that come within AMBIGUOUS of it, neither
+    part of it nor more: the drive cannot tell them apart. Each of their groups must raise the log
+    evidence by its `_price`. The prior releases all groups of the sets that come so close, and what
     else raises the evidence: not certain enough to be told, but the covariances include it. Wide
     standard deviations are multiplied by GROSS if an entry that is released would be further off
     than MAX_WIDE_SIGMAS.
@@ -268,23 +269,12 @@ def _proposal(fit):
         best = sets.groups[k]
         if not best or sets.furthest[k] < MAX_WIDE_SIGMAS:
             break
-    close = np.flatnonzero(sets.merit > sets.merit[k] - DECISIVE_RELEASE)
-    rivals = [sets.groups[each] for each in close if not _are_nested(sets.groups[each], best)]
-    explanations = (best, *rivals)
-    k = _released_set(calibration, sets, certain=best.union(*rivals), default=k)
+    close = np.flatnonzero(sets.merit > sets.merit[k] - AMBIGUOUS)
+    told = [sets.groups[each] for each in close]
+    explanations = tuple(some for some in told if not (some < best or some > best))
+    k = _released_set(calibration, sets, certain=frozenset().union(*told), default=k)
     present = _log_evidence(L, h, _in_wide_sigmas(calibration, L, fit.problem.prior.root))[0]
     return _Proposal(explanations, sets.priors[k], sets.evidence[k] - present)
-
-
-def _are_nested(some, others):
-    """Whether one of two sets of groups holds the other, as radii hold one factor on both."""
-    some = _with_parts(some)
-    others = _with_parts(others)
-    return some <= others or some >= others
-
-
-def _with_parts(groups):
-    return groups | {WHEEL_SCALE} if "wheel-radii" in groups else groups
 
 
 def _sets(calibration, L, h, width):
