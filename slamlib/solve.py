@@ -405,7 +405,7 @@ def solve_folders(folders: Sequence[Path], out: Path | str, jobs: int | None = N
 
     summaries = Parallel(n_jobs=jobs)(
         delayed(solve)(name, folder) for name, folder in by_name.items())
-    table = drive_table(summaries).to_csv(index=False)
+    table = drive_table(summaries).convert_dtypes().to_csv(index=False)
     files.write_file(out / "drives.csv", table.encode())
     return summaries
 
@@ -424,4 +424,4 @@ def drive_table(summaries: Sequence[dict]):
             rows.append(drive | row | {"problem": problem, "doubts": len(row["doubts"])})
         if not summary["problems"]:
             rows.append(drive)
-    return pandas.DataFrame(rows, columns=COLUMNS).convert_dtypes()
+    return pandas.DataFrame(rows, columns=COLUMNS)
