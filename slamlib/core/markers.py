@@ -146,9 +146,9 @@ def _relocalized(sightings, confirmed, table, is_known, frame):
     second = table[frame, label]
     count = len(parents)
     found = robust_increments(sightings.z, sightings.C, pair, first, second, count)
-    is_sure = confirmed[first] & confirmed[second]
-    votes = np.bincount(pair, found.accepted * (1 + is_sure), count)
-    trusted = found.usable & (votes > 1)
+    accepted = np.bincount(pair, found.accepted, count)
+    sure = np.bincount(pair, found.accepted & confirmed[first] & confirmed[second], count)
+    trusted = found.usable & ((accepted > 1) | (sure > 0))
     if not trusted.any():
         return None
     best = np.argmax(trusted)

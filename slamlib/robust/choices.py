@@ -23,7 +23,7 @@ import logging
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from itertools import combinations
+from itertools import combinations, compress
 from typing import NamedTuple
 
 import numpy as np
@@ -245,21 +245,19 @@ class _Sets(NamedTuple):
 
     groups: list[frozenset]      # (s,)
     priors: list[Prior]          # (s,)
-    roots: np.ndarray            # (s, p, p) of the priors, in wide sigmas
     evidence: np.ndarray         # (s,) log evidence
     merit: np.ndarray            # (s,) log evidence less the prices of the groups
+    surprise: np.ndarray         # (s,) part of the prices, of statements with a standard deviation
     furthest: np.ndarray         # (s,) largest posterior mean of what is released, in its sigmas
 
 
 def _proposal(fit):
     """The _Proposal of the groups of the calibration of a Fit that the evidence wants released.
 
-    `explanations` are the best set of groups and others that come within AMBIGUOUS of it, neither
-    part of it nor more: the drive cannot tell them apart. Each of their groups must raise the log
-    evidence by its `_price`. The prior releases all groups of the sets that come so close, and what
-    else raises the evidence: not certain enough to be told, but the covariances include it. Wide
-    standard deviations are multiplied by GROSS if an entry that is released would be further off
-    than MAX_WIDE_SIGMAS.
+    `explanations` are the best set of groups and others that the drive cannot tell from it, neither
+    part of it nor more. The prior releases all their groups, and what else raises the evidence: not
+    certain enough to be told, but the covariances include it. Wide standard deviations are
+    multiplied by GROSS if an entry that is released would be further off than MAX_WIDE_SIGMAS.
     """
     calibration = fit.problem.measurements.calibration
     L, h = _likelihood(fit)
@@ -269,10 +267,9 @@ def _proposal(fit):
         best = sets.groups[k]
         if not best or sets.furthest[k] < MAX_WIDE_SIGMAS:
             break
-    close = np.flatnonzero(sets.merit > sets.merit[k] - AMBIGUOUS)
-    told = [sets.groups[each] for each in close]
+    told = _as_likely(sets, k)
     explanations = tuple(some for some in told if not (some < best or some > best))
-    k = _released_set(calibration, sets, certain=frozenset().union(*told), default=k)
+    k = _released_set(sets, certain=frozenset().union(*told), default=k)
     present = _log_evidence(L, h, _in_wide_sigmas(calibration, L, fit.problem.prior.root))[0]
     return _Proposal(explanations, sets.priors[k], sets.evidence[k] - present)
 
@@ -286,17 +283,33 @@ def _sets(calibration, L, h, width):
     groups = np.unique(calibration.group[doubtful]).tolist()
     if doubtful[RADII].all():
         groups.append(WHEEL_SCALE)
-    price = {group: _price(calibration, group) for group in groups}
     sets = [frozenset(some) for count in range(MAX_GROUPS + 1)
             for some in combinations(groups, count)]
     priors = [calibration.prior(some, width) for some in sets]
     given = np.array([prior.root for prior in priors])
-    released = np.diagonal(given, axis1=1, axis2=2) > calibration.sigma
+    is_released = np.diagonal(given, axis1=1, axis2=2) > calibration.sigma
     roots = _in_wide_sigmas(calibration, L, given)
     evidence, mean = _log_evidence(L, h, roots)
-    furthest = (released * np.abs(mean)).max(axis=1)
+    price = {group: _price(calibration, group) for group in groups}
+    surprise = {group: _surprise(calibration, group) for group in groups}
     prices = np.array([sum(price[group] for group in some) for some in sets])
-    return _Sets(sets, priors, roots, evidence, evidence - prices, furthest)
+    surprises = np.array([sum(surprise[group] for group in some) for some in sets])
+    return _Sets(sets, priors, evidence, evidence - prices, surprises,
+                 furthest=np.max(np.abs(mean), axis=1, where=is_released, initial=0.0))
+
+
+def _as_likely(sets, best):
+    """List of the groups of _Sets that the drive cannot tell from number `best`, which is one.
+
+    They come within AMBIGUOUS of it, with the surprise or without, and each of their groups is
+    worth its price and surprise.
+    """
+    merit = dict(zip(sets.groups, sets.merit))
+    without_surprise = sets.merit + sets.surprise
+    is_close = ((sets.merit > sets.merit[best] - AMBIGUOUS)
+                | (without_surprise > without_surprise[best] - AMBIGUOUS))
+    return [some for some in compress(sets.groups, is_close)
+            if all(merit[some] > merit[some - {group}] for group in some)]
 
 
 def _in_wide_sigmas(calibration, L, roots):
@@ -304,26 +317,22 @@ def _in_wide_sigmas(calibration, L, roots):
     return (np.diag(L) > 0)[:, None] / calibration.wide[:, None] * roots
 
 
-def _released_set(calibration, sets, certain, default):
-    """Number of the most probable of the _Sets that hold `certain`, the `default` if there is none.
-
-    Fully stated groups are less probable by STATED each.
-    """
-    stated = {group: calibration.sigma[calibration.of_group(group)].all()
-              for group in frozenset().union(*sets.groups)}
-    surprise = STATED * np.array([sum(stated[group] for group in some) for some in sets.groups])
+def _released_set(sets, certain, default):
+    """Number of the most probable of the _Sets that hold `certain`, the `default` if none does."""
     holding = [k for k, some in enumerate(sets.groups) if certain <= some]
-    probable = sets.evidence - surprise
+    probable = sets.evidence - sets.surprise
     return max(holding, key=probable.item, default=default)
 
 
 def _price(calibration, group):
     """Log evidence by which a group must raise that of the rest to be told: its prior odds."""
-    entries = calibration.of_group(group)
-    count = 1 if group == WHEEL_SCALE else np.count_nonzero(entries)
-    price = DECISIVE_RELEASE + FURTHER_ENTRY * (count - 1)
-    is_stated = calibration.sigma[entries].any()
-    return price + STATED if is_stated else price
+    count = 1 if group == WHEEL_SCALE else np.count_nonzero(calibration.of_group(group))
+    return DECISIVE_RELEASE + FURTHER_ENTRY * (count - 1) + _surprise(calibration, group)
+
+
+def _surprise(calibration, group):
+    """The part of its `_price` for a standard deviation that is stated."""
+    return STATED if calibration.sigma[calibration.of_group(group)].any() else 0.0
 
 
 def _log_evidence(L, h, root):
