@@ -301,15 +301,18 @@ def _sets(calibration, L, h, width):
 def _as_likely(sets, best):
     """List of the groups of _Sets that the drive cannot tell from number `best`, which is one.
 
-    They come within AMBIGUOUS of it, with the surprise or without, and each of their groups is
-    worth its price and surprise.
+    They come within AMBIGUOUS of it. So does one more, whatever standard deviations are stated: the
+    best of the others of which each group is worth its price.
     """
+    first = sets.groups[best]
     merit = dict(zip(sets.groups, sets.merit))
-    without_surprise = sets.merit + sets.surprise
-    is_close = ((sets.merit > sets.merit[best] - AMBIGUOUS)
-                | (without_surprise > without_surprise[best] - AMBIGUOUS))
-    return [some for some in compress(sets.groups, is_close)
-            if all(merit[some] > merit[some - {group}] for group in some)]
+    likely = compress(sets.groups, sets.merit > sets.merit[best] - AMBIGUOUS)
+    likelihood = sets.merit + sets.surprise
+    others = [some for some in compress(sets.groups, likelihood > likelihood[best] - AMBIGUOUS)
+              if not (some <= first or some > first)
+              and all(merit[some] > merit[some - {group}] for group in some)]
+    others.sort(key=merit.get)
+    return [*likely, *others[-1:]]
 
 
 def _in_wide_sigmas(calibration, L, roots):
