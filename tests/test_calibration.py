@@ -227,6 +227,15 @@ def test_wheels_that_only_ranges_contradict_are_told_from_the_scale_of_ranges():
     assert_right(found, truth, 1.5 * aligned_ate(estimate(dataset), truth))
 
 
+def test_wheels_that_drift_and_markers_are_as_likely_although_the_wheels_are_stated():
+    dataset, truth = drive(13)
+    grown = np.linspace(1, 1.02, len(dataset.ticks))[:, None]
+    drifting = replace(dataset, ticks=np.rint(grown * dataset.ticks))
+    found = estimate(drifting.without("uwb"))
+    assert {"marker-size", "wheel-radii"} <= found.released
+    assert mean_nees(found, truth) < 8
+
+
 def test_counts_that_were_cut_off_say_so_and_leave_the_metre_to_the_markers():
     """7 of 8 counts in 127 may be missing: 2.8 % of each distance."""
     dataset, truth = drive(12)
