@@ -234,9 +234,13 @@ def _chance(ticks, slipping):
 
     It is large in spikes of the counts, and in rows in which the wheels are `slipping` (n,).
     """
+    return np.cumsum(np.where(_spikes(ticks) | slipping, SPIKE_CHANCE, 1.0))
+
+
+def _spikes(ticks):
+    """Rows (n,), bool, with far larger counts than all others."""
     counts = np.abs(ticks).max(axis=1)
-    spike = counts > SPIKE * np.quantile(counts, 0.99)
-    return np.cumsum(np.where(spike | slipping, SPIKE_CHANCE, 1.0))
+    return counts > SPIKE * np.quantile(counts, 0.99)
 
 
 def _cost(squared):
@@ -263,7 +267,8 @@ def _found(ticks, s, drive, slipping):
         unknown = dict.fromkeys(dead, 2 * _usual(drive)) | unknown
         tried = _bridged(s, drive, suspects, rank, unknown)
     found = [jump for jump in tried if jump.found]
-    return _without_bad_frames(drive, found + _beside(s, drive, found, rank))
+    has_spike = _rows_in_steps(_spikes(ticks), s.frame) > 0
+    return _without_bad_frames(drive, found + _beside(s, drive, found, rank), has_spike)
 
 
 def _beside(s, drive, found, rank):
@@ -275,11 +280,16 @@ def _beside(s, drive, found, rank):
     return [jump for jump in _bridged(s, moved, beside, rank, {}) if jump.found]
 
 
-def _without_bad_frames(drive, found):
-    """The _Jumps but those that soon cancel: in between, sightings are wrong, or late."""
+def _without_bad_frames(drive, found, has_spike):
+    """The _Jumps but those that soon cancel: in between, sightings are wrong, or late.
+
+    Not if the counts have a spike in the last step of these, a mask (f-1,).
+    """
     kept = []
     for jump in sorted(found, key=attrgetter("step")):
         kept.append(jump)
+        if has_spike[jump.step]:
+            continue
         for k in reversed(range(len(kept) - 1)):
             if jump.step - kept[k].step > MAX_BAD_FRAMES:
                 break
