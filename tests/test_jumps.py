@@ -147,7 +147,8 @@ FAULTS = {                                                # and the largest rati
     "carried": (lambda d: carried(d, 1001, 1301), np.inf),
     "pushed by 6 cm": (lambda d: carried(d, 1001, 1007), 1.5),
     "one wheel dead": (counts(slice(1003, 1053), lambda ticks: ticks * [0, 1]), 1.5),
-    "three spikes": (counts([1004, 1404, 1803], lambda ticks: ticks + [4096, 0]), 1.5),
+    "spikes, two of which cancel": (counts(
+        [1004, 1404, 1412], lambda ticks: ticks + np.outer([1, 1, -1], [4096, 0])), 1.5),
     "dead for a third": (counts(slice(1334, None), lambda ticks: 0 * ticks), 4.0)}
 
 
