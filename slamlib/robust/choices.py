@@ -247,7 +247,7 @@ class _Sets(NamedTuple):
     priors: list[Prior]          # (s,)
     evidence: np.ndarray         # (s,) log evidence
     merit: np.ndarray            # (s,) log evidence less the prices of the groups
-    surprise: np.ndarray         # (s,) part of the prices, of statements with a standard deviation
+    surprise: np.ndarray         # (s,) part of the prices, of groups that are stated in full
     furthest: np.ndarray         # (s,) largest posterior mean of what is released, in its sigmas
 
 
@@ -329,13 +329,15 @@ def _released_set(sets, certain, default):
 
 def _price(calibration, group):
     """Log evidence by which a group must raise that of the rest to be told: its prior odds."""
-    count = 1 if group == WHEEL_SCALE else np.count_nonzero(calibration.of_group(group))
-    return DECISIVE_RELEASE + FURTHER_ENTRY * (count - 1) + _surprise(calibration, group)
+    entries = calibration.of_group(group)
+    count = 1 if group == WHEEL_SCALE else np.count_nonzero(entries)
+    price = DECISIVE_RELEASE + FURTHER_ENTRY * (count - 1)
+    return price + STATED * calibration.sigma[entries].any()
 
 
 def _surprise(calibration, group):
-    """The part of its `_price` for a standard deviation that is stated."""
-    return STATED if calibration.sigma[calibration.of_group(group)].any() else 0.0
+    """The part of its `_price` by which a group is less probable, if it is stated in full."""
+    return STATED * calibration.sigma[calibration.of_group(group)].all()
 
 
 def _log_evidence(L, h, root):
