@@ -66,7 +66,7 @@ def test_chapters_name_the_datasets_that_have_what_they_need_and_show_no_warning
     for data in filter(Path.is_dir, (folder / "data").iterdir()):
         assert data.name in text and data.name in pages["index"]
     markers = text_of(pages["2_aruco_localization"])
-    assert pages["3_odometry_aruco_slam"].count("data:image/gif") == 1
+    assert pages["3_odometry_aruco_slam"].count("data:image/gif;base64") == 1
     assert "sparse" in markers and not re.search("wheels_only|waits|one_pose", markers)
     for name, page in pages.items():                              # no defects of the notebooks
         assert 'class="stderr"' not in page, name
