@@ -66,6 +66,7 @@ def test_chapters_name_the_datasets_that_have_what_they_need_and_show_no_warning
     for data in filter(Path.is_dir, (folder / "data").iterdir()):
         assert data.name in text and data.name in pages["index"]
     markers = text_of(pages["2_aruco_localization"])
+    assert pages["3_odometry_aruco_slam"].count("data:image/gif;base64") == 1
     assert "sparse" in markers and not re.search("wheels_only|waits|one_pose", markers)
     for name, page in pages.items():                              # no defects of the notebooks
         assert 'class="stderr"' not in page, name
@@ -211,3 +212,9 @@ def test_links_inside_the_report_lead_somewhere(visited):
             assert target.exists(), f"{path.name}: {link}"
             if address.fragment:
                 assert unquote(address.fragment) in ids[target.name], f"{path.name}: {link}"
+
+
+def test_a_map_is_enlarged_in_a_box_that_scrolls(visited):
+    _, page = next(each for each in visited if each[0].stem[0] == "3")
+    page.check(".zoom input")
+    assert page.eval_on_selector(".map", "e => e.scrollWidth > 2.9 * e.clientWidth")

@@ -40,7 +40,8 @@ local function picture(image)
   if not typst then
     if content:find 'id="tip: ' then -- a map whose landmarks can be asked
       local svg = content:match "<svg.*":gsub('<g id="tip: ([^"]*)">', "<g><title>%1</title>")
-      return pandoc.RawInline("html", svg)
+      return pandoc.RawInline("html", '<label class="zoom"><input type="checkbox"> Enlarge</label>'
+        .. '<span class="map" tabindex="0" role="group" aria-label="Map">' .. svg .. "</span>")
     end
     image.src = pandoc.mediabag.make_data_uri(kind, content)
     return image
