@@ -22,7 +22,7 @@ ROOT = Path(__file__).parents[1]
 # By the seconds of processors that they take: several processes take one file after the other.
 FIRST = ("test_pages test_studies test_slam test_localization test_calibration test_jumps test_uwb "
          "test_concurrency test_part_faults test_results test_numbers test_properties test_memory ")
-BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+BROWSERS = "chromium chromium-browser google-chrome".split()
 
 
 def pytest_collection_modifyitems(items):
@@ -34,7 +34,7 @@ def pytest_terminal_summary(terminalreporter):
     """Tells which studies were computed by older code, or other packages, than are here."""
     from slamlib.studies.runs import made_by
     old = [file.stem for file in sorted((ROOT / "notebooks" / "studies").glob("*.csv"))
-           if not file.read_text(encoding="utf-8").startswith(made_by())]
+           if not file.read_text().startswith(made_by())]
     if old:
         terminalreporter.write_line(
             f"Studies of other code or packages, which 'make studies' renews: {', '.join(old)}.")
@@ -142,13 +142,12 @@ def report_on_all(tmp_path_factory):
     write_dataset(data / "long", *simulate("long", 2, poses=900, late_ranges=0.05))
     new, truth = simulate("short", 77, poses=300, late_ranges=0.15)
     bare = new.without("aruco").without("uwb")
-    sparse = new.aruco.pose % 150 == 0
     for name, dataset, true in (
             ("no truth", new, None),
             ("wheels_only", replace(bare, ticks=np.r_[np.zeros((100, 2)), bare.ticks[:200]]), None),
             ("one_pose", bare.first(1), None),
             ("one_sighting", only(new, [0]), truth),
-            ("sparse", only(new, sparse), truth)):
+            ("sparse", only(new, new.aruco.pose % 150 == 0), truth)):
         write_dataset(data / name, dataset, true)
     copied(folder / "notebooks", "*.ipynb")
     built_elsewhere(folder / "notebooks", data, folder / "report", folder / "results",

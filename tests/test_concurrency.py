@@ -38,9 +38,9 @@ def start(folder, *arguments):
                             env=os.environ | {"PYTHONPATH": str(ROOT)})
 
 
-def wait_for(file, process, seconds=300):
+def wait_for(file, process):
     """Wait until a file is there, while a process runs."""
-    until = time.monotonic() + seconds
+    until = time.monotonic() + 300
     while not file.exists():
         if process.poll() is not None or time.monotonic() > until:
             process.kill()

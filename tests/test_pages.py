@@ -38,7 +38,7 @@ STICKING_OUT = """() => {
 @pytest.fixture(scope="module")
 def built(report_on_all):
     """The folder of the shared report, and the text of its pages by name."""
-    return report_on_all, {page.stem: page.read_text(encoding="utf-8")
+    return report_on_all, {page.stem: page.read_text()
                            for page in (report_on_all / "report").glob("*.html")}
 
 
@@ -98,8 +98,8 @@ def mixed(tmp_path_factory):
     whole, _ = short(3, step=3)                                     # which returns to its start
     write_dataset(folder / "data" / "good", whole)
     write_dataset(folder / "data" / "bad", contradicted(dataset))
-    told = vehicle(slip=2e-3, marker_noise_factor=1.25, range_noise_factor=0.75)
-    write_dataset(folder / "data" / "told", told(dataset))
+    write_dataset(folder / "data" / "told", vehicle(
+        slip=2e-3, marker_noise_factor=1.25, range_noise_factor=0.75)(dataset))
     copied(folder / "notebooks", "[234]*.ipynb", first=FAILING)
     return folder, built_elsewhere(folder / "notebooks", folder / "data", folder / "report",
                                    folder / "results", folder / "kept")
@@ -114,9 +114,9 @@ def test_a_drive_that_fails_is_left_out_of_its_chapter_and_costs_the_others_noth
         written = {each.name for each in (folder / "results" / name).glob("problem*")}
         assert written == {*PROBLEMS} - {"problem1", *problems}        # no chapter 1 here
     for number, title in ((1, "ArUco"), (2, "SLAM: odometry + ArUco")):
-        text = text_of(report.files[number].read_text(encoding="utf-8"))
+        text = text_of(report.files[number].read_text())
         assert f"bad: The problem “{title}” could not be solved: expected" in text
-    assert ">bad</td>" in report.files[3].read_text(encoding="utf-8")
+    assert ">bad</td>" in report.files[3].read_text()
 
 
 def lost(solver, drive, *arguments, **options):

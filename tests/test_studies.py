@@ -88,7 +88,7 @@ def test_the_line_of_a_file_changes_with_the_code_that_computes(
 def checked(name, *arguments, rows=studies.rows, **options):
     """What `studies.rows` returns; what this code wrote of the long path is not computed again."""
     file = ROOT / "notebooks" / "studies" / f"{name}.csv"
-    if options.get("path") == "long" and file.read_text("utf-8").startswith(runs.made_by()):
+    if options.get("path") == "long" and file.read_text().startswith(runs.made_by()):
         return pd.read_csv(file, comment="#", index_col="seed")
     return rows(name, *arguments, **options)
 
