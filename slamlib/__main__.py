@@ -13,9 +13,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 from slamlib.core.errors import DatasetError, require  # noqa: E402
 
 RESULTS = Path("results")  # folder of the .mat files of a build
-EXECUTED_NOTEBOOKS = Path("build", "executed")  # folder in which executed notebooks are kept
+EXECUTED_NOTEBOOKS = Path("build/executed")  # folder in which executed notebooks are kept
 HAND_IN = Path("hand-in.zip")
-HAND_IN_PAGES = Path("build", "hand-in")  # folder of the report that is handed in
+HAND_IN_PAGES = Path("build/hand-in")  # folder of the report that is handed in
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -66,9 +66,9 @@ def _parser():
     add("folders", nargs="+", type=Path, help="a dataset's folder; each of several has its results "
         "in the folder of its name in OUT, and drives.csv is the table over all")
     add("--out", type=Path, required=True, help="folder for the results")
-    add("-j", "--jobs", type=int, default=1, help="datasets solved at a time (default 1)")
+    add("-j", "--jobs", type=int, help="datasets solved at a time (default 1)")
     add("--problem", action="append", default=[],
-        choices=("1", "2", "2_hint", "2_fused", "3", "4"),
+        choices="1 2 2_hint 2_fused 3 4".split(),
         help="one of %(choices)s, of which 2 is markers alone; may be repeated (default: all); 4 "
         "starts from 3 where both are solved")
     add("-v", "--verbose", action="store_true", help="print to stderr what is decided on the way: "
@@ -90,11 +90,9 @@ def _build(options):
             "another folder of the datasets: this one is for the results")
     try:
         report = build_report(notebooks_folder(), options.data, pages, RESULTS,
-                              EXECUTED_NOTEBOOKS, options.datasets or None, shown)
+                              EXECUTED_NOTEBOOKS, options.datasets, shown)
     except NotebookError as error:
         return _ended(1, error)
-    if not shown.author:
-        print("report.toml names no author: the PDF's title page has none", file=sys.stderr)
     code = _told(report.summaries)
     if options.command == "hand-in":
         handin.write_zip(HAND_IN, report, RESULTS, shown)
@@ -129,11 +127,12 @@ def _solve(options):
     from slamlib.solve import solve_folder, solve_folders
     problems = [f"problem{each}" for each in options.problem]
     if options.verbose:
-        logging.basicConfig(format="%(message)s", level=logging.INFO)
-    if len(options.folders) > 1:
+        logging.basicConfig(format="%(message)s", level="INFO")
+    first, *others = options.folders
+    if others:
         summaries = solve_folders(options.folders, options.out, options.jobs, problems)
     else:
-        summaries = [solve_folder(options.folders[0], options.out, problems)]
+        summaries = [solve_folder(first, options.out, problems)]
     code = _told(summaries)
     print(f"results: {options.out.resolve()}", file=sys.stderr)
     return code

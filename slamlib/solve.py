@@ -333,11 +333,12 @@ def _write_estimated_vehicle(path, vehicle, rows):
     for entry in learned.get("calibration", ()):
         name = entry["name"]
         if entry["released"] and hasattr(vehicle, name):
-            estimated[name] = entry["estimate"]
-            estimated[f"sigma_{name}"] = entry["sigma"]
+            digits = 3 - int(np.log10(entry["sigma"]))             # to a hundredth of sigma
+            estimated[name] = round(entry["estimate"], digits)
+            estimated[f"sigma_{name}"] = float(f"{entry['sigma']:.3g}")
     for name, fact in NOISE.items():
         if fact in learned and getattr(vehicle, name) is None:
-            estimated[name] = learned[fact]
+            estimated[name] = float(f"{learned[fact]:.4g}")
     path.unlink(missing_ok=True)
     if estimated:
         write_vehicle(path, replace(vehicle, **estimated))
@@ -359,11 +360,15 @@ def solve_folder(folder: Path, out: Path, problems: Collection[str] = ()) -> dic
     """Read the dataset in a folder, solve it into the folder `out`; returns the summary.
 
     What was read is printed to stderr. `problems` are keys of `PROBLEMS`, or none for all that the
-    sensors allow. Raises DatasetError if the dataset is malformed or does not allow a problem.
+    sensors allow. Raises DatasetError if the dataset is malformed or does not allow a problem; then
+    there is no summary, as an earlier one may be of other data.
     """
+    is_inside = out.resolve().is_relative_to(folder.resolve())
+    if not is_inside:
+        with suppress(OSError):
+            (out / results.SUMMARY).unlink()
     dataset = read_dataset(folder)
-    require(not out.resolve().is_relative_to(folder.resolve()), out,
-            "another folder for the results: this one is in the dataset's")
+    require(not is_inside, out, "another folder for the results: this one is in the dataset's")
     truth = read_truth(folder)
     print("\n".join(inventory_lines(dataset, truth)), file=sys.stderr)
     for problem in problems:

@@ -55,7 +55,7 @@ def survives(module, text):
     """True if the fast tests pass where a module has this text."""
     with tempfile.TemporaryDirectory() as package:
         shutil.copytree(ROOT / "slamlib", Path(package, "slamlib"))
-        Path(package, "slamlib", module).write_text(text, encoding="utf-8")
+        Path(package, "slamlib", module).write_text(text)
         try:
             done = subprocess.run(
                 [sys.executable, "-m", "pytest", "-qx", "-p", "no:cacheprovider", "-m", "not slow",
@@ -88,9 +88,9 @@ def main():
     only = "".join(sys.argv[1:])
     source = ROOT / "slamlib"
     names = (f"{folder}/{file.name}" for folder in FOLDERS for file in (source / folder).glob("*"))
-    texts = {name: (source / name).read_text(encoding="utf-8") for name in sorted(names)
+    texts = {name: (source / name).read_text() for name in sorted(names)
              if name.startswith(only) and name.endswith(".py")}
-    if not survives("__init__.py", (source / "__init__.py").read_text(encoding="utf-8")):
+    if not survives("__init__.py", (source / "__init__.py").read_text()):
         sys.exit("A test fails without a mutant.")
     drawn = [*islice(mutants(texts), COUNT)]
     with ThreadPoolExecutor(os.cpu_count()) as threads:

@@ -16,11 +16,14 @@ from slamlib.studies.montecarlo import antenna_error
 from slamlib.studies.simulation import PATHS, simulate
 
 
-def short(seed, poses=None, path="short", rounds=1, **options):
-    """A simulated drive whose path is driven `rounds` times, or its first poses."""
+def short(seed, poses=None, path="short", rounds=1, step=1, **options):
+    """A simulated drive whose path is driven `rounds` times, or its first poses.
+
+    Steps of the encoder, and so the images, are `step` times as far apart as usual.
+    """
     layout = PATHS[path]
     turns = tuple(rounds * turn for turn in layout.turns)
-    PATHS["rounds"] = replace(layout, turns=turns, poses=rounds * layout.poses)
+    PATHS["rounds"] = replace(layout, turns=turns, poses=rounds * layout.poses // step)
     dataset, truth = simulate("rounds", seed, poses=poses, **options)
     return replace(dataset, name=path), truth
 

@@ -9,8 +9,9 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
+import psutil
 import pytest
-from conftest import ROOT, file_names, is_running
+from conftest import ROOT, file_names
 from numeric import short
 from test_report import build, make_data, write
 
@@ -37,9 +38,9 @@ def start(folder, *arguments):
                             env=os.environ | {"PYTHONPATH": str(ROOT)})
 
 
-def wait_for(file, process, seconds=300):
+def wait_for(file, process):
     """Wait until a file is there, while a process runs."""
-    until = time.monotonic() + seconds
+    until = time.monotonic() + 300
     while not file.exists():
         if process.poll() is not None or time.monotonic() > until:
             process.kill()
@@ -180,4 +181,4 @@ time.sleep(1000)""",))
     assert process.returncode == 130
     assert told.splitlines()[-1] == "slamlib: ended by a signal" and "Traceback" not in told
     assert file_names(tmp_path / "results") == [] and hidden(tmp_path) == []
-    assert not is_running(int(kernel.read_text()))
+    assert not psutil.pid_exists(int(kernel.read_text()))

@@ -26,7 +26,7 @@ def imported(folder=""):
     """Names of the modules from which those in a folder of slamlib import, in functions too."""
     statement = re.compile(r"^ *(?:from (?=\S+ import)|import (?!\S+ [^a]))([\w.]+)", re.MULTILINE)
     return {name for file in (PACKAGE / folder).rglob("*.py")
-            for name in statement.findall(file.read_text(encoding="utf-8"))}
+            for name in statement.findall(file.read_text())}
 
 
 def outside(folder=""):

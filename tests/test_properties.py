@@ -70,7 +70,7 @@ def measured(draw, poses, landmarks, rng):
 
 def sightings_from(draw, path, rng):
     """Rows (m, 11) of ArucoReading.txt from poses (n, 3)."""
-    ids = IDS[:chosen(draw, 1, 3, 6, 60)]
+    ids = IDS[:chosen(draw, 1, 3, 6, 20)]
     near = path[rng.integers(len(path), size=len(ids))]
     marker = near + rng.uniform(-3, 3, near.shape)
     pose, which = measured(draw, len(path), len(ids), rng)

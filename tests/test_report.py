@@ -81,10 +81,10 @@ def test_files_are_index_chapters_that_a_dataset_allows_in_order_and_the_pdf(bui
                                              "report.pdf"]
     assert sorted((root / "report").iterdir()) == sorted(
         [*pages, root / "report" / ".pages"])
-    index = pages[0].read_text(encoding="utf-8")
+    index = pages[0].read_text()
     assert {"1_odometry.html", "2_other.html", "report.pdf"} <= {
         *re.findall(r'<a\s[^>]*href="([^"]*)"', index)}
-    assert "<title>1. Odometry</title>" in pages[1].read_text("utf-8")
+    assert "<title>1. Odometry</title>" in pages[1].read_text()
     assert file_names(root / "results") == [
         "short/old.mat", "short/own/ArucoMap.mat", "short/summary.json"]
 
@@ -92,7 +92,7 @@ def test_files_are_index_chapters_that_a_dataset_allows_in_order_and_the_pdf(bui
 def test_kernels_see_the_folders_and_what_is_printed_in_a_row_is_one_output(built):
     """However long it takes. Kernels run this interpreter."""
     root, pages = built
-    text = pages[2].read_text(encoding="utf-8")
+    text = pages[2].read_text()
     assert str(root / "data") in text and sys.executable in text
     assert '<pre class="stderr"><code>stderr is shown' in text
     assert re.search(r"\nshort\n?</code></pre>", text)
@@ -150,7 +150,7 @@ def test_a_problem_that_fails_is_said_with_exit_code_3(tmp_path, monkeypatch, ca
         told = "".join(capsys.readouterr())
         assert f"1 of 1: 1_solve, {progress}" in told
         assert "short: problem2 could not be solved: localize: expected " in told
-    text = html.unescape((tmp_path / "report" / "index.html").read_text(encoding="utf-8"))
+    text = html.unescape((tmp_path / "report" / "index.html").read_text())
     assert "The problem “ArUco” could not be solved: localize: expected " in text
 
 
@@ -199,7 +199,7 @@ def test_every_entry_is_read(tmp_path):
 
 
 def test_the_committed_file_has_the_defaults_also_where_its_examples_are_read(tmp_path):
-    text = (ROOT / "report.toml").read_text(encoding="utf-8")
+    text = (ROOT / "report.toml").read_text()
     assert read_options(ROOT / "report.toml") == Options(course="Robotic Perception and Action")
     examples = re.sub(r"^# (?=\w+ = )", "", text, flags=re.MULTILINE)
     (tmp_path / "report.toml").write_text(examples)

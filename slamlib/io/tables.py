@@ -64,7 +64,7 @@ class Table:
             return self
         row = np.argmin(ok)
         expected = next(each for each, right in checks.items() if not right[row])
-        found = " ".join(f"{number:.12g}" for number in self.numbers[row])
+        found = shorten(" ".join(f"{number:.12g}" for number in self.numbers[row]), 40)
         fault = f"{self.kind} {self.lines[row]}: expected {expected}, found '{found}'"
         dropped = np.count_nonzero(~ok)
         if dropped > most:
@@ -73,7 +73,7 @@ class Table:
 
     def ids(self, column: int) -> np.ndarray:
         """The whole numbers of a column, (m,) int64."""
-        return self.numbers[:, column].astype(np.int64)
+        return self.numbers[:, column].astype(int)
 
     def rows(self, which: np.ndarray) -> "Table":
         """The Table of rows by a mask or indices."""
@@ -255,4 +255,4 @@ def _not_read(paths):
     if not paths:
         return []
     names = ", ".join(repr(path.name) for path in paths)
-    return [f"Not read: {shorten(names, 100, placeholder=' ...')}."]
+    return [f"Not read: {shorten(names, 100)}."]

@@ -47,7 +47,7 @@ def build_report(notebooks: Path, data: Path, report: Path, results: Path, kept:
     notebooks, data : folders of the `*.ipynb` files and of the datasets, one sub-folder each.
     report, results : folders of the pages and of the result files; created if absent.
     kept : folder that caches executed notebooks.
-    datasets : names of the selected datasets; None for all, without simulated ones if others are.
+    datasets : names of the selected datasets; without any, all but simulated ones if others are.
     options : the title page and what is shown.
     """
     data = data.resolve()
@@ -60,6 +60,8 @@ def build_report(notebooks: Path, data: Path, report: Path, results: Path, kept:
         stages = [kept / source.stem / cache.RESULTS for source in books]
         summaries = [_write_results(drive, stages, results / drive.name) for drive in drives]
         names = _write_pages(books, keys, drives, summaries, options, results, report)
+    if not options.author:
+        _say("report.toml names no author: the PDF's title page has none")
     return Report([report / name for name in names], summaries)
 
 
