@@ -125,24 +125,6 @@ def test_a_spike_is_likely_to_be_the_jump_also_in_reverse():
     assert np.flatnonzero(chance > 1).tolist() == [6, 8]               # into poses 7 and 9
 
 
-def straight(*x):
-    """The _Drive of frames at x (f,) on a line, with a wheelbase of 0.4 m."""
-    return jumps._Drive.without_jumps(np.outer(x, [1.0, 0, 0]), 0.4)
-
-
-def test_a_usual_motion_may_be_to_the_side():
-    assert_allclose(jumps._usual(straight(0, 0.3, 0.6)), [0.3, 0.3, 0.1])
-
-
-def test_the_covariance_of_a_motion_by_hand():
-    """Two metres with a slip of 1 cm and floors of 3 mm and 3 mrad; a jump in the second step."""
-    drive = replace(straight(0, 1.5, 2).with_variance(1, [0.04, 0.01]), slip=0.01)
-    turn = 0.01 + 2 * 2 * (0.01 / 0.4)**2 + 9e-6
-    aside = 0.04 + turn * 2**2 / 3 + 9e-6
-    found = drive.motions([0], [2])
-    assert_allclose(found.covariance, [np.diag([aside + 2 * 1e-4 / 2, aside, turn])])
-
-
 FAULTS = {                                                # and the largest ratio of the ATE
     "carried": (lambda d: carried(d, 1001, 1301), np.inf),
     "pushed by 6 cm": (lambda d: carried(d, 1001, 1007), 1.5),
