@@ -1,7 +1,7 @@
 # make report   executes the notebooks on every dataset in data/ and writes report/ and results/
 # make hand-in  builds the report and writes hand-in.zip: the PDF and the .mat files to hand in
 # make test     checks the style, and runs all tests
-# make quick    runs the tests that take less than a minute in all
+# make quick    runs most tests, in a minute or two
 # make studies  computes the rows of all studies anew, notebooks/studies/*.csv, or those of the
 #               notebooks that CHAPTERS names
 # make mutants  prints which small defects of the numerics no test notices
