@@ -2,7 +2,8 @@
 
 Markers and wheels both measure increments [x, y, heading] of the vehicle. Wrong axes or signs of
 one of them change these to [A (x, y), det(A) heading], A one of the eight symmetries of a square.
-Exchanged wheels and a camera mirrored in y and theta have the same A. Wrong units show in ratios of
+Exchanged wheels and a camera mirrored in y and theta have the same A; one wheel that is reversed
+has none. Wrong units show in ratios of
 lengths, and of stated standard deviations to the scatter of measurements.
 """
 
@@ -20,12 +21,12 @@ from slamlib.robust.part_faults import (
     MIN_AGREEING_SHARE,
     MIN_COUNT,
     MIN_MOTION_SIGMAS,
-    MOTIONS,
     contradictions,
     later_delay,
     moving_increments,
     other_axes,
     with_headings_reversed,
+    with_other_axes,
     with_wheels_mended,
 )
 
@@ -41,12 +42,16 @@ MIN_DIFFERENT_COUNTS = 8  # from which on a common divisor says that counts were
 # Kinds of doubts from which most others follow
 DECISIVE = ("encoder-dead", "wheels-swapped", "wheels-reversed", "camera-mirrored", "camera-turned",
             "odometry", "units")
-# What [x, y] is with each of AXES, and by their number the kind of doubt and the change of the
-# counts with the same effect.
+# What [x, y] is with each of AXES, and by their number, or that of ONE_REVERSED, the kind of doubt
+# and the change of the counts with the same effect.
 AXES_NAMES = ("x, y", "x, -y", "-x, y", "-x, -y", "y, x", "-y, x", "y, -x", "-y, -x")
 COUNTS = {1: ("wheels-swapped", "the columns exchanged"),
           2: ("wheels-reversed", "both signs reversed"),
-          3: ("wheels-reversed", "both signs reversed and the columns exchanged")}
+          3: ("wheels-reversed", "both signs reversed and the columns exchanged"),
+          8: ("wheels-reversed", "the sign of the right wheel reversed"),
+          9: ("wheels-reversed", "the sign of the right wheel reversed and the columns exchanged"),
+          10: ("wheels-reversed", "the sign of the left wheel reversed"),
+          11: ("wheels-reversed", "the sign of the left wheel reversed and the columns exchanged")}
 
 
 @dataclass(frozen=True)
@@ -98,7 +103,8 @@ def motion_doubts(dataset: Dataset) -> list[Doubt]:
     if len(wheels) < MIN_COUNT:
         return []
     with_both_signs = np.stack([markers, with_headings_reversed(dataset)])
-    off = contradictions(with_both_signs, wheels @ MOTIONS, sigma)
+    off = contradictions(with_both_signs, with_other_axes(dataset, wheels, poses), sigma)
+    off[len(AXES):, 1] = np.inf                            # one cause
     dead = ~dataset.ticks.any(axis=0)
     if dead.any() and np.mean(off[0, 0] < 1) < MIN_AGREEING_SHARE:
         return [_dead_doubt(dead)]
@@ -120,18 +126,20 @@ def _dead_doubt(dead):
 def _axes_doubt(stretch, is_mended):
     """The Doubt on OtherAxes, which may be mended for the solutions."""
     k = stretch.axes
-    is_mirror = np.linalg.det(AXES[k]) < 0
-    heading = "-theta" if is_mirror != stretch.is_reversed else "theta"
-    change = (f"sightings with [{AXES_NAMES[k]}, {heading}] in place of [x, y, theta] in "
-              "ArucoReading.txt")
-    what = "camera-mirrored" if is_mirror or stretch.is_reversed else "camera-turned"
+    changes = []
+    if k < len(AXES):
+        is_mirror = np.linalg.det(AXES[k]) < 0
+        heading = "-theta" if is_mirror != stretch.is_reversed else "theta"
+        changes.append(f"sightings with [{AXES_NAMES[k]}, {heading}] in place of [x, y, theta] in "
+                       "ArucoReading.txt")
+        what = "camera-mirrored" if is_mirror or stretch.is_reversed else "camera-turned"
     if k in COUNTS and not stretch.is_reversed:
         what, change_of_counts = COUNTS[k]
-        change = f"{change_of_counts} in encoderReading.txt, or as well with {change}"
+        changes.insert(0, f"{change_of_counts} in encoderReading.txt")
     sentence = (f"Between poses {stretch.first + 1} and {stretch.last + 1}, increments of the "
                 f"vehicle by markers and by wheels agree at {stretch.stated.mean():.0%} of "
                 f"{len(stretch.stated)} places, and at {stretch.agreeing.mean():.0%} with "
-                f"{change}.")
+                f"{', or as well with '.join(changes)}.")
     if is_mended:
         sentence += " Problem 2's fusion and problems 3 and 4 use the counts changed so."
     return Doubt(what, sentence, (
@@ -182,8 +190,10 @@ def wrong_sizes(markers: np.ndarray, wheels: np.ndarray, sigma: np.ndarray,
 def range_units(dataset: Dataset) -> Iterator[Doubt]:
     """Doubt, if ranges do not fit the size of odometry's path, or the guesses.
 
-    Of the path while its heading is known, and of antennas with MIN_RANGES_PER_ANTENNA on it.
+    Of the path while its heading is known, with its wheels mended, and of antennas with
+    MIN_RANGES_PER_ANTENNA on it.
     """
+    dataset = with_wheels_mended(dataset)
     guesses = dataset.antenna_guess
     if dataset.uwb is None or guesses is None:
         return

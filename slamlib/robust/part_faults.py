@@ -1,9 +1,10 @@
 """Faults of a part of a drive, by increments of the vehicle that markers and wheels measure.
 
-Wheels may be exchanged or reversed for a while: then increments by markers and by wheels agree with
-other axes. Increments [x, y, heading] with other axes or signs are [A (x, y), det(A) heading], A
-one of the eight symmetries of a square. The stretch is the one in which they contradict each other
-less by most in all. Such counts are mended.
+Wheels may be exchanged, or one or both reversed, for a while: then increments by markers and by
+wheels agree with other counts, or, but for one wheel, with other axes. Increments [x, y, heading]
+with other axes or signs are [A (x, y), det(A) heading], A one of the eight symmetries of a square.
+The stretch is the one in which they contradict each other less by most in all. Such counts are
+mended.
 
 Something may move the camera: from then on, it is elsewhere in the vehicle than stated. A camera
 that is off by c = [x, y, turn] changes the position of an increment [p, h] by
@@ -64,15 +65,18 @@ STRETCH_LENGTHS = 30      # number of lengths that are tried
 MAX_WHEELS_STRETCH = 0.3  # of the increments, longest such stretch
 WHEELS_SIGMA = 0.05       # relative, of the distances by the wheels there
 MAX_SCALE = 5.0           # of the squared residuals; beyond it wheels slip everywhere
-# The matrices A, and by their number the changes of the counts with the same effect.
+# The matrices A.
 AXES = np.array([np.diag(signs) @ order for order in (np.eye(2), np.eye(2)[::-1])
                  for signs in ((1, 1), (1, -1), (-1, 1), (-1, -1))])
 # By number of AXES: increments (n, 3) by wheels @ MOTIONS are (8, 1, n, 3) with these axes.
 MOTIONS = np.zeros((8, 1, 3, 3))
 MOTIONS[:, 0, :2, :2] = AXES.mT
 MOTIONS[:, 0, 2, 2] = np.linalg.det(AXES)
-EXCHANGED = (1, 3)
-REVERSED = (2, 3)
+# Changes of counts (n, 2) @ them with the same effect as the first of AXES, by their number, and
+# behind AXES these with the right wheel reversed before.
+COUNTS = {0: np.eye(2), 1: np.eye(2)[::-1], 2: -np.eye(2), 3: -np.eye(2)[::-1]}
+RIGHT_REVERSED = np.array([-1, 1])
+ONE_REVERSED = {len(AXES) + k: np.diag(RIGHT_REVERSED) @ COUNTS[k] for k in COUNTS}
 
 
 @lru_cache(maxsize=2)
@@ -106,30 +110,46 @@ def _compared(dataset):
     Also the increments by wheels between each pair, and its encoder poses.
     """
     s = sightings_by_frame(dataset.sightings)
-    path = odometry.dead_reckoning(dataset.ticks, dataset.vehicle, model="arc")[s.frame]
-    span = _span(path)
+    path = _path(dataset)[s.frame]
+    span = min(_span(path), _span(_path(dataset, RIGHT_REVERSED)[s.frame]))
     common = np.array(common_sightings(s.row, s.marker, span))
     overlapping = common[:, common[0] % max(1, span // OVERLAP) == 0]
     poses = np.column_stack([s.frame[:-span], s.frame[span:]])
     return s, overlapping, se2.between(path[:-span], path[span:]), poses
 
 
+def _path(dataset, signs=1):
+    """Poses (n, 3) by odometry, with other `signs` (2,) of the counts."""
+    return odometry.dead_reckoning(signs * dataset.ticks, dataset.vehicle, model="arc")
+
+
+def with_other_axes(dataset: Dataset, wheels: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    """Increments by wheels (12, 1, n, 3), by number of AXES and ONE_REVERSED.
+
+    From those as stated, `wheels` (n, 3), between encoder poses (n, 2).
+    """
+    path = _path(dataset, RIGHT_REVERSED)
+    one_reversed = se2.between(path[poses[:, 0]], path[poses[:, 1]])
+    return np.concatenate([wheels @ MOTIONS, one_reversed @ MOTIONS[:len(COUNTS)]])
+
+
 def with_wheels_mended(dataset: Dataset) -> Dataset:
     """The Dataset with its counts mended in a stretch in which wheels are exchanged or reversed.
 
-    It is as it was where that is most of the drive: then the camera may as well have other axes. Of
+    It is as it was where that is most of the drive and the camera may as well have other axes. Of
     all ends of the stretch nearby, the increments agree best with the one that is chosen.
     """
     markers, wheels, sigma, poses = moving_increments(dataset)
     if len(wheels) < MIN_COUNT:
         return dataset
-    stretch = other_axes(contradictions(markers[None], wheels @ MOTIONS, sigma), poses)
+    by_wheels = with_other_axes(dataset, wheels, poses)
+    stretch = other_axes(contradictions(markers[None], by_wheels, sigma), poses)
     if stretch is None or not stretch.is_mended(len(dataset.ticks)):
         return dataset
 
     def cost(changed):
         """What still contradicts the markers."""
-        path = odometry.dead_reckoning(changed.ticks, changed.vehicle, model="arc")
+        path = _path(changed)
         by_wheels = se2.between(path[poses[:, 0]], path[poses[:, 1]])
         return _limited(contradictions(markers, by_wheels, sigma)).sum()
 
@@ -178,7 +198,7 @@ def _span(path):
 class OtherAxes(NamedTuple):
     """A stretch of a drive in which markers and wheels agree with other axes or signs."""
 
-    axes: int                # row of AXES
+    axes: int                # number of AXES, or behind them of ONE_REVERSED
     is_reversed: bool        # whether theta is, too
     first: int               # encoder pose, from 0, at which it begins
     last: int                # at which it ends
@@ -186,26 +206,26 @@ class OtherAxes(NamedTuple):
     agreeing: np.ndarray     # (m,) bool, which agree with these axes
 
     def is_mended(self, count: int) -> bool:
-        """Whether counts have the same effect, in less than half of the `count` poses."""
-        is_by_counts = self.axes in EXCHANGED + REVERSED and not self.is_reversed
+        """Whether counts have the same effect, but for one wheel in less than half of all poses."""
+        if self.axes in ONE_REVERSED:
+            return True
+        is_by_counts = self.axes in COUNTS and not self.is_reversed
         return is_by_counts and self.last - self.first < MAX_STRETCH * count
 
     def mended(self, dataset: Dataset, first: int, last: int) -> Dataset:
         """The Dataset with counts of these axes from the pose `first` to the pose `last`."""
         ticks = dataset.ticks.copy()
         rows = slice(max(first, 0) + 1, last + 1)
-        if self.axes in EXCHANGED:
-            ticks[rows] = ticks[rows, ::-1]
-        if self.axes in REVERSED:
-            ticks[rows] = -ticks[rows]
+        ticks[rows] = ticks[rows] @ (COUNTS | ONE_REVERSED)[self.axes]
         return replace(dataset, ticks=ticks)
 
 
 def other_axes(off: np.ndarray, poses: np.ndarray) -> OtherAxes | None:
     """OtherAxes, if significantly more increments agree with them; the stretch may be the drive.
 
-    `off` (8, k, n) are the `contradictions` by AXES, for theta as stated and then reversed, of
-    increments between these encoder poses (n, 2). In the stretch they are less by most in all.
+    `off` (12, k, n) are the `contradictions` of `with_other_axes`, for theta as stated and then
+    reversed, of increments between these encoder poses (n, 2). In the stretch they are less by most
+    in all.
     """
     agree = off < 1
     limited = _limited(off)
@@ -225,7 +245,7 @@ def other_axes(off: np.ndarray, poses: np.ndarray) -> OtherAxes | None:
 def _stretch_of_most_gain(gain):
     """Indices of axes and of reversal, begin and end of the stretch with the greatest sum of gains.
 
-    The gain (8, k, n) is that of each increment. Of the stretches that end at an increment, the
+    The gain (12, k, n) is that of each increment. Of the stretches that end at an increment, the
     best one begins where the sum from the first increment on is least.
     """
     total = np.insert(np.cumsum(gain, axis=2), 0, 0, axis=2)
