@@ -230,9 +230,8 @@ def test_wheels_that_only_ranges_contradict_are_told_from_the_scale_of_ranges():
 def test_wheels_that_drift_and_markers_are_as_likely_although_the_wheels_are_stated():
     dataset, truth = drive(13)
     grown = np.linspace(1, 1.02, len(dataset.ticks))[:, None]
-    drifting = replace(dataset, ticks=np.rint(grown * dataset.ticks))
-    found = estimate(drifting.without("uwb"))
-    assert {"marker-size", "wheel-radii"} <= found.released
+    found = estimate(replace(dataset, uwb=None, ticks=np.rint(grown * dataset.ticks)))
+    assert found.released == {"marker-size", "wheel-radii"}
     assert mean_nees(found, truth) < 8
 
 
@@ -250,7 +249,7 @@ def test_counts_that_were_cut_off_say_so_and_leave_the_metre_to_the_markers():
 
 
 def test_few_different_counts_are_no_counts_that_were_cut_off():
-    assert common_divisor(np.array([[0, 0], [127, 127], [254, 0], [-127, 127]])) == 1
+    assert common_divisor(np.array([[127, 127], [254, 0], [-127, 127]])) == 1
     assert common_divisor(6.5 * np.arange(16).reshape(8, 2)) == 1
 
 
