@@ -206,7 +206,7 @@ def test_a_wrong_statement_is_named_alone_and_mended_and_not_taken_for_slip(what
     dataset, truth = drive(seed)
     spoilt = spoil(dataset, truth)
     before = [doubt.what for doubt in doubts_before_solving(spoilt)]
-    assert before == ["odometry"] * (what == "wheelbase")
+    assert before == ["units"] * (what == "wheelbase")
     markers, both = problems_3_and_4(spoilt)
     assert named(both) == {what}
     assert named(markers) <= {what, "marker-size"} and bool(named(markers)) == markers_tell

@@ -20,17 +20,18 @@ from slamlib.robust.part_faults import (
     AXES,
     MIN_AGREEING_SHARE,
     MIN_COUNT,
-    MIN_MOTION_SIGMAS,
     contradictions,
     later_delay,
     moving_increments,
     other_axes,
     with_headings_reversed,
     with_other_axes,
+    with_sightings_inverted,
     with_wheels_mended,
 )
 
 MIN_RANGES_PER_ANTENNA = 4
+MIN_UNIT_SHARE = 0.9      # of the increments that one factor explains
 MAX_FACTOR = 5.0          # ratio of lengths from which on the unit is in doubt
 MAX_SIGMA_RATIO = 15.0    # of a stated standard deviation to the scatter; in degrees it is 57
 MAX_ODOMETRY_HEADING_SIGMA = 0.1   # rad, at the end of the path that is compared with ranges
@@ -38,10 +39,11 @@ MAX_ODOMETRY_HEADING_SIGMA = 0.1   # rad, at the end of the path that is compare
 MIN_SPREAD = 0.027
 MAX_SPREAD = 4.7
 SECOND_DIFFERENCE = 0.6745 * 6**0.5      # median size, of independent errors of sigma 1
+MIN_DIFFERENT_TOTALS = 50   # values of counts that grow, from which on they may be totals
 MIN_DIFFERENT_COUNTS = 8  # from which on a common divisor says that counts were cut off
 # Kinds of doubts from which most others follow
-DECISIVE = ("encoder-dead", "wheels-swapped", "wheels-reversed", "camera-mirrored", "camera-turned",
-            "odometry", "units")
+DECISIVE = ("encoder-dead", "encoder-totals", "wheels-swapped", "wheels-reversed",
+            "camera-mirrored", "camera-turned", "sightings-inverted", "odometry", "units")
 # What [x, y] is with each of AXES, and by their number, or that of ONE_REVERSED, the kind of doubt
 # and the change of the counts with the same effect.
 AXES_NAMES = ("x, y", "x, -y", "-x, y", "-x, -y", "y, x", "-y, x", "y, -x", "-y, -x")
@@ -66,10 +68,10 @@ class Doubt:
 def doubts_before_solving(dataset: Dataset) -> list[Doubt]:
     """List of Doubts about the files of a Dataset, where enough is known."""
     doubts = []
-    for check in (motion_doubts, delay_doubts, range_units, sigma_units, cut_counts):
+    for check in (totals, motion_doubts, delay_doubts, range_units, sigma_units, cut_counts):
         with suppress(np.linalg.LinAlgError):              # where increments have no covariance
             doubts += list(check(dataset))
-        if any(doubt.what == "encoder-dead" for doubt in doubts):
+        if any(doubt.what in ("encoder-dead", "encoder-totals") for doubt in doubts):
             break                                          # the others need the path by odometry
     return doubts
 
@@ -111,7 +113,24 @@ def motion_doubts(dataset: Dataset) -> list[Doubt]:
     stretch = other_axes(off, poses)
     if stretch is not None:
         return [_axes_doubt(stretch, stretch.is_mended(len(dataset.ticks)))]
-    return list(wrong_sizes(markers, wheels, sigma, off[0, 0] < 1))
+    inverted = contradictions(with_sightings_inverted(dataset), wheels, sigma)
+    shares = np.mean(np.stack([off[0, 0], inverted]) < 1, axis=1)
+    if shares[0] < 0.5 and shares[1] > MIN_AGREEING_SHARE:
+        return [_inverted_doubt(*shares)]
+    return list(wrong_sizes(markers, wheels, sigma))
+
+
+def totals(dataset: Dataset) -> Iterator[Doubt]:
+    """Doubt, if the counts of each wheel only grow, or only fall, from row to row."""
+    counts = dataset.ticks[1:]
+    change = np.diff(counts, axis=0)
+    grows = (change >= 0).all(axis=0) | (change <= 0).all(axis=0)
+    different = [len(np.unique(each)) for each in counts.T]
+    if grows.all() and min(different) > MIN_DIFFERENT_TOTALS:
+        yield Doubt("encoder-totals", (
+            "The counts of both wheels in encoderReading.txt only grow or only fall from row to "
+            "row, as totals do; each row should have the counts since the row before."),
+            "Look whether the differences of successive rows are meant, and write these.")
 
 
 def _dead_doubt(dead):
@@ -121,6 +140,15 @@ def _dead_doubt(dead):
         f"All counts of the {wheels} wheel in encoderReading.txt are 0, and the markers say that "
         "the vehicle moved otherwise. Only problem 2 from markers alone does without them."),
         "Look at the encoder, and at the columns of the file.")
+
+
+def _inverted_doubt(stated, inverted):
+    """The Doubt on sightings that are the vehicle in the marker, by shares that agree."""
+    return Doubt("sightings-inverted", (
+        f"Increments of the vehicle by markers and by wheels agree at {stated:.0%} of the places, "
+        f"and at {inverted:.0%} if ArucoReading.txt has the vehicle as the marker sees it in place "
+        "of the marker as the vehicle does."), (
+        "Look at the frame of x, y and theta in ArucoReading.txt, and invert the poses."))
 
 
 def _axes_doubt(stretch, is_mended):
@@ -158,33 +186,43 @@ def delay_doubts(dataset: Dataset) -> Iterator[Doubt]:
             "Look at the clocks of camera and encoders, and for lost rows.")
 
 
-def wrong_sizes(markers: np.ndarray, wheels: np.ndarray, sigma: np.ndarray,
-                agree: np.ndarray) -> Iterator[Doubt]:
+def wrong_sizes(markers: np.ndarray, wheels: np.ndarray,
+                sigma: np.ndarray) -> Iterator[Doubt]:
     """Doubt, if increments (n, 3) by markers and wheels are of other units or drives.
 
-    Of other units if the medians of length or turn differ by MAX_FACTOR, of other drives if most
-    increments do not agree, `agree` (n,). `sigma` (n, 2) is that of lengths and turns by markers.
+    Of other units if they agree where those by wheels are multiplied by one factor in length and
+    one in turn, of other drives if most do not agree. A camera that is turned changes neither
+    length nor turn. `sigma` (n, 2) is that of lengths and turns by markers.
     """
-    by_markers = np.median(distance_and_turn(markers), axis=0)
-    by_wheels = np.median(distance_and_turn(wheels), axis=0)
-    least = np.maximum(MAX_FACTOR * np.minimum(by_markers, by_wheels),
-                       MIN_MOTION_SIGMAS * np.median(sigma, axis=0))
-    differ = np.maximum(by_markers, by_wheels) > least
-    what = "odometry"
-    advice = ("Look whether encoderReading.txt and ArucoReading.txt are of the same drive and "
-              "count the same poses.")
-    if (differ & (by_wheels > 0)).any():
-        what = "units"
-        advice = ("Look at the units of x and y in ArucoReading.txt (metres), of the radii "
-                  "(metres) and ticks_per_revolution, and of the wheelbase in vehicle.toml "
-                  "(metres).")
-    elif agree.mean() > 0.5:
+    agree = contradictions(markers, wheels, sigma) < 1
+    sizes = [distance_and_turn(each) for each in (markers, wheels)]
+    by_markers, by_wheels = np.median(sizes, axis=1)
+    of_markers, of_wheels = [_along_x(each) for each in (markers, wheels)]
+    agree_in_size = contradictions(of_markers, of_wheels, sigma) < 1
+    if agree.mean() > 0.5 or agree_in_size.mean() > MIN_AGREEING_SHARE:
         return
-    yield Doubt(what, (
-        f"Between the same poses the vehicle moves by {by_markers[0]:.4g} m and turns by "
-        f"{by_markers[1]:.4g} rad by the markers, and by {by_wheels[0]:.4g} m and "
-        f"{by_wheels[1]:.4g} rad by the wheels (medians); they agree at {agree.mean():.0%} of "
-        f"{len(agree)} places."), advice)
+    sentence = (f"Between the same poses the vehicle moves by {by_markers[0]:.4g} m and turns by "
+                f"{by_markers[1]:.4g} rad by the markers, and by {by_wheels[0]:.4g} m and "
+                f"{by_wheels[1]:.4g} rad by the wheels (medians); they agree at "
+                f"{agree.mean():.0%} of {len(agree)} places")
+    factor = by_markers / np.maximum(by_wheels, 1e-9)
+    scaled = contradictions(of_markers, factor[[0, 0, 1]] * of_wheels, sigma) < 1
+    if scaled.mean() > MIN_UNIT_SHARE:
+        yield Doubt("units", (
+            f"{sentence}, and at {scaled.mean():.0%} with {factor[0]:.3g} times the length and "
+            f"{factor[1]:.3g} times the turn by the wheels."), (
+            "Look at the units of x and y in ArucoReading.txt (metres), of the radii (metres) and "
+            "ticks_per_revolution, and of the wheelbase in vehicle.toml (metres)."))
+    else:
+        yield Doubt("odometry", f"{sentence}.", (
+            "Look whether encoderReading.txt and ArucoReading.txt are of the same drive and count "
+            "the same poses."))
+
+
+def _along_x(increments):
+    """Increments (n, 3) of the same length and turn, straight ahead."""
+    length = np.linalg.norm(increments[:, :2], axis=1)
+    return np.column_stack([length, np.zeros(len(length)), increments[:, 2]])
 
 
 def range_units(dataset: Dataset) -> Iterator[Doubt]:

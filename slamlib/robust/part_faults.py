@@ -97,9 +97,19 @@ def moving_increments(
 
 def with_headings_reversed(dataset: Dataset) -> np.ndarray:
     """The increments by markers (n, 3) of `moving_increments`, for theta of the opposite sign."""
-    s, common, wheels, poses = _compared(dataset)
     mirror = np.diag([1.0, 1.0, -1.0])
-    by_markers = robust_increments(s.z @ mirror, mirror @ s.C @ mirror, *common, len(wheels))
+    return _by_changed(dataset, lambda z, C: (z @ mirror, mirror @ C @ mirror))
+
+
+def with_sightings_inverted(dataset: Dataset) -> np.ndarray:
+    """The same for sightings that are the vehicle, as a marker sees it."""
+    return _by_changed(dataset, lambda z, C: (se2.inverse(z), C))
+
+
+def _by_changed(dataset, change):
+    """The increments by markers (n, 3) of `moving_increments`, of z and C that `change` returns."""
+    s, common, wheels, poses = _compared(dataset)
+    by_markers = robust_increments(*change(s.z, s.C), *common, len(wheels))
     moving = np.isin(poses[:, 0], moving_increments(dataset)[3][:, 0])
     return by_markers.increment[moving]
 
