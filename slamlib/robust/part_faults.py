@@ -57,7 +57,8 @@ MAX_BUMP = 0.3            # m and rad, of a motion of the camera
 BUMP_SIGMA = 0.2          # m and rad, of a camera about its stated place, before and after
 DELAY_UNIT = 50.0         # encoder steps; BUMP_SIGMA of them is the sigma of a delay, too
 DELAYS = range(-12, 13)   # encoder steps, of a delay of the whole drive
-MIN_DELAY_GAIN = 6.0      # of squared residuals, each up to a limit, by a change of the delay
+MIN_DELAY_GAIN = 6.0      # of squared residuals, each up to a limit, by a change of the delay, in
+                          # the variance that they show, if that is above the stated one
 MAX_DELAY_COST = 0.83     # of the squared residuals, each up to a limit, without this change
 REWEIGHTED = 4            # times, by the residuals
 MIN_WHEELS_GAIN = 25.0    # of squared residuals, by other wheels in a stretch
@@ -362,8 +363,10 @@ def later_delay(dataset: Dataset) -> LaterDelay | None:
     found = min(at_each, key=cost)
     by_one = [found._replace(steps=each) for each in {steps - 1, steps + 1} - {0}]
     found = min([found, *by_one], key=cost)
+    least = cost(found)
     without = cost(found._replace(steps=0))
-    if cost(found) > min(MAX_DELAY_COST * without, without - MIN_DELAY_GAIN * OVERLAP):
+    variance = max(1.0, least / (2 * len(poses)))
+    if least > min(MAX_DELAY_COST * without, without - MIN_DELAY_GAIN * variance * OVERLAP):
         return None
     found = found._replace(pose=found.pose + round(dataset.vehicle.sighting_lag))
     log.info("sightings: from pose %d on %d steps later", found.pose + 1, found.steps)
