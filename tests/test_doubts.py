@@ -92,7 +92,6 @@ FLAWS = {                                           # how, kinds of doubts, and 
     "vehicle in mm": (vehicle(right_radius=100.0, left_radius=100.0, wheelbase=400.0),
                       "units units", "vehicle.toml"),
     "diameters": (vehicle(right_radius=0.2, left_radius=0.2), "units", "0.5"),
-    "totals": (lambda d: replace(d, ticks=d.ticks.cumsum(axis=0)), "encoder-totals", "grow"),
     "the vehicle as markers see it": (
         lambda d: aruco(d, marker_in_vehicle=se2.inverse(d.aruco.marker_in_vehicle)),
         "sightings-inverted", "as the marker sees it"),

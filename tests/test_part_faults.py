@@ -109,6 +109,10 @@ def test_a_delay_that_changes_is_found_beside_one_before_and_a_camera_elsewhere(
     assert delay.steps == -5 and abs(delay.pose - 1000) < 50
 
 
+def test_slips_on_few_increments_are_no_change_of_the_delay():
+    assert later_delay(short(9112, 600, slip=0.03)[0]) is None
+
+
 @pytest.mark.parametrize("seed", [41, 42, 43])
 def test_a_delay_that_stays_is_no_change(seed):
     clean = short(seed, slip=3e-3, mislabelled=0.05)[0]

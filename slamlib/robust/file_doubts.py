@@ -39,13 +39,11 @@ MAX_ODOMETRY_HEADING_SIGMA = 0.1   # rad, at the end of the path that is compare
 MIN_SPREAD = 0.027
 MAX_SPREAD = 4.7
 SECOND_DIFFERENCE = 0.6745 * 6**0.5      # median size, of independent errors of sigma 1
-MIN_DIFFERENT_TOTALS = 50   # values of counts that grow, from which on they may be totals
 MIN_DIFFERENT_COUNTS = 8  # from which on a common divisor says that counts were cut off
 # Kinds of doubts from which most others follow
-DECISIVE = ("encoder-dead", "encoder-totals", "wheels-swapped", "wheels-reversed",
-            "camera-mirrored", "camera-turned", "sightings-inverted", "odometry", "units")
-# What [x, y] is with each of AXES, and by their number, or that of ONE_REVERSED, the kind of doubt
-# and the change of the counts with the same effect.
+DECISIVE = ("encoder-dead", "wheels-swapped", "wheels-reversed", "camera-mirrored", "camera-turned",
+            "sightings-inverted", "odometry", "units")
+# What [x, y] is with each of AXES, and by number of COUNT_CHANGES the kind of doubt and the change.
 AXES_NAMES = ("x, y", "x, -y", "-x, y", "-x, -y", "y, x", "-y, x", "y, -x", "-y, -x")
 COUNTS = {1: ("wheels-swapped", "the columns exchanged"),
           2: ("wheels-reversed", "both signs reversed"),
@@ -68,10 +66,10 @@ class Doubt:
 def doubts_before_solving(dataset: Dataset) -> list[Doubt]:
     """List of Doubts about the files of a Dataset, where enough is known."""
     doubts = []
-    for check in (totals, motion_doubts, delay_doubts, range_units, sigma_units, cut_counts):
+    for check in (motion_doubts, delay_doubts, range_units, sigma_units, cut_counts):
         with suppress(np.linalg.LinAlgError):              # where increments have no covariance
             doubts += list(check(dataset))
-        if any(doubt.what in ("encoder-dead", "encoder-totals") for doubt in doubts):
+        if any(doubt.what == "encoder-dead" for doubt in doubts):
             break                                          # the others need the path by odometry
     return doubts
 
@@ -113,24 +111,13 @@ def motion_doubts(dataset: Dataset) -> list[Doubt]:
     stretch = other_axes(off, poses)
     if stretch is not None:
         return [_axes_doubt(stretch, stretch.is_mended(len(dataset.ticks)))]
-    inverted = contradictions(with_sightings_inverted(dataset), wheels, sigma)
-    shares = np.mean(np.stack([off[0, 0], inverted]) < 1, axis=1)
-    if shares[0] < 0.5 and shares[1] > MIN_AGREEING_SHARE:
-        return [_inverted_doubt(*shares)]
+    stated = np.mean(off[0, 0] < 1)
+    if stated < 0.5:
+        off = contradictions(with_sightings_inverted(dataset), wheels, sigma)
+        inverted = np.mean(off < 1)
+        if inverted > MIN_AGREEING_SHARE:
+            return [_inverted_doubt(stated, inverted)]
     return list(wrong_sizes(markers, wheels, sigma))
-
-
-def totals(dataset: Dataset) -> Iterator[Doubt]:
-    """Doubt, if the counts of each wheel only grow, or only fall, from row to row."""
-    counts = dataset.ticks[1:]
-    change = np.diff(counts, axis=0)
-    grows = (change >= 0).all(axis=0) | (change <= 0).all(axis=0)
-    different = [len(np.unique(each)) for each in counts.T]
-    if grows.all() and min(different) > MIN_DIFFERENT_TOTALS:
-        yield Doubt("encoder-totals", (
-            "The counts of both wheels in encoderReading.txt only grow or only fall from row to "
-            "row, as totals do; each row should have the counts since the row before."),
-            "Look whether the differences of successive rows are meant, and write these.")
 
 
 def _dead_doubt(dead):

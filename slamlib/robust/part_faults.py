@@ -73,11 +73,13 @@ AXES = np.array([np.diag(signs) @ order for order in (np.eye(2), np.eye(2)[::-1]
 MOTIONS = np.zeros((8, 1, 3, 3))
 MOTIONS[:, 0, :2, :2] = AXES.mT
 MOTIONS[:, 0, 2, 2] = np.linalg.det(AXES)
-# Changes of counts (n, 2) @ them with the same effect as the first of AXES, by their number, and
-# behind AXES these with the right wheel reversed before.
-COUNTS = {0: np.eye(2), 1: np.eye(2)[::-1], 2: -np.eye(2), 3: -np.eye(2)[::-1]}
+# Changes of counts (n, 2) @ them: by number of the first four AXES, with the same effect as these;
+# behind AXES, the same after the right wheel was reversed.
+EXCHANGE = np.eye(2)[::-1]
+COUNT_CHANGES = {0: np.eye(2), 1: EXCHANGE, 2: -np.eye(2), 3: -EXCHANGE}
 RIGHT_REVERSED = np.array([-1, 1])
-ONE_REVERSED = {len(AXES) + k: np.diag(RIGHT_REVERSED) @ COUNTS[k] for k in COUNTS}
+COUNT_CHANGES |= {len(AXES) + k: np.diag(RIGHT_REVERSED) @ change
+                  for k, change in COUNT_CHANGES.items()}
 
 
 @lru_cache(maxsize=2)
@@ -135,13 +137,13 @@ def _path(dataset, signs=1):
 
 
 def with_other_axes(dataset: Dataset, wheels: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    """Increments by wheels (12, 1, n, 3), by number of AXES and ONE_REVERSED.
+    """Increments by wheels (12, 1, n, 3), by number of AXES and COUNT_CHANGES.
 
     From those as stated, `wheels` (n, 3), between encoder poses (n, 2).
     """
     path = _path(dataset, RIGHT_REVERSED)
     one_reversed = se2.between(path[poses[:, 0]], path[poses[:, 1]])
-    return np.concatenate([wheels @ MOTIONS, one_reversed @ MOTIONS[:len(COUNTS)]])
+    return np.concatenate([wheels @ MOTIONS, one_reversed @ MOTIONS[:4]])
 
 
 def with_wheels_mended(dataset: Dataset) -> Dataset:
@@ -209,7 +211,7 @@ def _span(path):
 class OtherAxes(NamedTuple):
     """A stretch of a drive in which markers and wheels agree with other axes or signs."""
 
-    axes: int                # number of AXES, or behind them of ONE_REVERSED
+    axes: int                # number of AXES or COUNT_CHANGES
     is_reversed: bool        # whether theta is, too
     first: int               # encoder pose, from 0, at which it begins
     last: int                # at which it ends
@@ -218,16 +220,16 @@ class OtherAxes(NamedTuple):
 
     def is_mended(self, count: int) -> bool:
         """Whether counts have the same effect, but for one wheel in less than half of all poses."""
-        if self.axes in ONE_REVERSED:
+        if self.axes >= len(AXES):
             return True
-        is_by_counts = self.axes in COUNTS and not self.is_reversed
+        is_by_counts = self.axes in COUNT_CHANGES and not self.is_reversed
         return is_by_counts and self.last - self.first < MAX_STRETCH * count
 
     def mended(self, dataset: Dataset, first: int, last: int) -> Dataset:
         """The Dataset with counts of these axes from the pose `first` to the pose `last`."""
         ticks = dataset.ticks.copy()
         rows = slice(max(first, 0) + 1, last + 1)
-        ticks[rows] = ticks[rows] @ (COUNTS | ONE_REVERSED)[self.axes]
+        ticks[rows] = ticks[rows] @ COUNT_CHANGES[self.axes]
         return replace(dataset, ticks=ticks)
 
 
