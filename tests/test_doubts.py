@@ -73,10 +73,8 @@ FLAWS = {                                           # how, kinds of doubts, and 
                           "Reading.txt, or as well with sightings with [x, -y, -theta]"),
     "signs of counts": (wheels(REVERSED), "wheels-reversed", "both signs reversed in encoder"
                         "Reading.txt, or as well with sightings with [-x, y, -theta]"),
-    "both": (wheels(BACKWARDS), "wheels-reversed", "signs reversed and the columns exchanged in "
-             "encoderReading.txt, or as well with"),
-    "sign of one": (wheels(ONE), "wheels-reversed", "with the sign of the left wheel "
-                    "reversed in encoderReading.txt. Problem 2"),
+    "both": (wheels(BACKWARDS), "wheels-reversed", "signs reversed and the columns exchanged"),
+    "sign of one": (wheels(ONE), "wheels-reversed", "with the sign of the left wheel reversed in"),
     "y": (camera(1, -1, 1), "camera-mirrored", "with [x, -y, theta]"),
     "all": (camera(-1, -1, -1), "camera-mirrored", "with [-x, -y, -theta]"),
     "x and y": (camera(-1, -1, 1), "wheels-reversed", "or as well with sightings with [-x, -y, t"),
@@ -116,6 +114,8 @@ def test_a_flaw_is_named(flaw, options):
         assert all("look" not in doubt.sentence.lower() for doubt in doubts)
         told = " ".join(f"{doubt.sentence} {doubt.advice}" for doubt in doubts)
         assert said in told
+        assert (", or as well with sightings" in told) == (
+            what.startswith("wheels-") and flaw != "sign of one")
 
 
 @pytest.mark.parametrize("matrix, what", [

@@ -104,7 +104,7 @@ def motion_doubts(dataset: Dataset) -> list[Doubt]:
         return []
     with_both_signs = np.stack([markers, with_headings_reversed(dataset)])
     off = contradictions(with_both_signs, with_other_axes(dataset, wheels, poses), sigma)
-    off[len(AXES):, 1] = np.inf                            # one cause
+    off[len(AXES):, 1] = np.inf                # either one wheel is reversed or theta, not both
     dead = ~dataset.ticks.any(axis=0)
     if dead.any() and np.mean(off[0, 0] < 1) < MIN_AGREEING_SHARE:
         return [_dead_doubt(dead)]
@@ -112,11 +112,11 @@ def motion_doubts(dataset: Dataset) -> list[Doubt]:
     if stretch is not None:
         return [_axes_doubt(stretch, stretch.is_mended(len(dataset.ticks)))]
     stated = np.mean(off[0, 0] < 1)
-    if stated < 0.5:
-        off = contradictions(with_sightings_inverted(dataset), wheels, sigma)
-        inverted = np.mean(off < 1)
-        if inverted > MIN_AGREEING_SHARE:
-            return [_inverted_doubt(stated, inverted)]
+    if stated > 0.5:
+        return []
+    inverted = np.mean(contradictions(with_sightings_inverted(dataset), wheels, sigma) < 1)
+    if inverted > MIN_AGREEING_SHARE:
+        return [_inverted_doubt(stated, inverted)]
     return list(wrong_sizes(markers, wheels, sigma))
 
 
@@ -175,18 +175,18 @@ def delay_doubts(dataset: Dataset) -> Iterator[Doubt]:
 
 def wrong_sizes(markers: np.ndarray, wheels: np.ndarray,
                 sigma: np.ndarray) -> Iterator[Doubt]:
-    """Doubt, if increments (n, 3) by markers and wheels are of other units or drives.
+    """Doubt, if increments (n, 3) by markers and wheels, of which most disagree, do so in size.
 
-    Of other units if they agree where those by wheels are multiplied by one factor in length and
-    one in turn, of other drives if most do not agree. A camera that is turned changes neither
-    length nor turn. `sigma` (n, 2) is that of lengths and turns by markers.
+    They are of other units if they agree where those by wheels are multiplied by one factor in
+    length and one in turn, else of other drives. A camera that is turned changes neither length nor
+    turn. `sigma` (n, 2) is that of lengths and turns by markers.
     """
     agree = contradictions(markers, wheels, sigma) < 1
     sizes = [distance_and_turn(each) for each in (markers, wheels)]
     by_markers, by_wheels = np.median(sizes, axis=1)
     of_markers, of_wheels = [_along_x(each) for each in (markers, wheels)]
     agree_in_size = contradictions(of_markers, of_wheels, sigma) < 1
-    if agree.mean() > 0.5 or agree_in_size.mean() > MIN_AGREEING_SHARE:
+    if agree_in_size.mean() > MIN_AGREEING_SHARE:
         return
     sentence = (f"Between the same poses the vehicle moves by {by_markers[0]:.4g} m and turns by "
                 f"{by_markers[1]:.4g} rad by the markers, and by {by_wheels[0]:.4g} m and "

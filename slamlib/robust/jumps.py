@@ -283,7 +283,8 @@ def _beside(s, drive, found, rank):
 def _without_bad_frames(drive, found, has_spike):
     """The _Jumps but those that soon cancel: in between, sightings are wrong, or late.
 
-    Not if the counts have a spike in the last step of these, a mask (f-1,).
+    Jumps of which the last one is in a step with a spike of the counts stay; `has_spike` is a mask
+    (f-1,).
     """
     kept = []
     for jump in sorted(found, key=attrgetter("step")):

@@ -124,7 +124,8 @@ def _compared(dataset):
     """
     s = sightings_by_frame(dataset.sightings)
     path = _path(dataset)[s.frame]
-    span = min(_span(path), _span(_path(dataset, RIGHT_REVERSED)[s.frame]))
+    other = _path(dataset, RIGHT_REVERSED)[s.frame]      # one of both may turn on the spot
+    span = min(_span(path), _span(other))
     common = np.array(common_sightings(s.row, s.marker, span))
     overlapping = common[:, common[0] % max(1, span // OVERLAP) == 0]
     poses = np.column_stack([s.frame[:-span], s.frame[span:]])
@@ -219,7 +220,11 @@ class OtherAxes(NamedTuple):
     agreeing: np.ndarray     # (m,) bool, which agree with these axes
 
     def is_mended(self, count: int) -> bool:
-        """Whether counts have the same effect, but for one wheel in less than half of all poses."""
+        """Whether the counts are mended.
+
+        Where a camera with other axes would have the same effect, less than half of the `count`
+        poses must be in the stretch.
+        """
         if self.axes >= len(AXES):
             return True
         is_by_counts = self.axes in COUNT_CHANGES and not self.is_reversed
