@@ -5,11 +5,17 @@ plain numbers. `solve_to_folder` does so for all problems of a dataset, `solve_f
 datasets.
 """
 
+import csv
+import multiprocessing
+import signal
 import sys
+import threading
 import time
 from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from io import StringIO
 from os.path import abspath
 from pathlib import Path
 from typing import NamedTuple
@@ -178,12 +184,20 @@ def solutions(dataset: Dataset, problems: Collection[str] = PROBLEMS) -> list[So
 
     A problem that cannot be solved has a Failure. Facts include the seconds that it took.
     """
+    listed = [problem for problem in PROBLEMS if problem in problems and allows(dataset, problem)]
+    slam = [problem for problem in listed if problem in ("problem3", "problem4")]
+    others = [problem for problem in listed if problem not in slam]
+    wait_for_others = _meanwhile(_in_turn, dataset, others)
+    found = _in_turn(dataset, slam)
+    return wait_for_others() + found
+
+
+def _in_turn(dataset, problems):
+    """The Solution or Failure of each of the `problems`."""
     by_markers = dataset.without("uwb")                  # the same one for problems 1 to 3
     previous = None
     every = []
-    for problem in PROBLEMS:
-        if problem not in problems or not allows(dataset, problem):
-            continue
+    for problem in problems:
         start = time.perf_counter()
         try:
             measured = dataset if problem == "problem4" else by_markers
@@ -196,6 +210,34 @@ def solutions(dataset: Dataset, problems: Collection[str] = PROBLEMS) -> list[So
             solution = _failure(problem, dataset, error)
         every.append(solution)
     return every
+
+
+def _meanwhile(function, *arguments):
+    """A function that waits for function(*arguments), which another process computes meanwhile.
+
+    That process is a copy of this one. Where no copy is safe, or it ended without a result, the
+    function is called when it is waited for.
+    """
+    if sys.platform != "linux" or threading.active_count() > 1:
+        return partial(function, *arguments)
+    processes = multiprocessing.get_context("fork")
+    receiver, sender = processes.Pipe(duplex=False)
+
+    def compute():
+        receiver.close()                         # so that it ends if nobody receives any more
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        sender.send(function(*arguments))
+
+    def wait():
+        try:
+            return receiver.recv()
+        except EOFError:
+            return function(*arguments)
+
+    processes.Process(target=compute, daemon=True).start()
+    sender.close()
+    return wait
 
 
 def write_results(out: Path | str, problem: str, found, dataset: Dataset,
@@ -410,18 +452,19 @@ def solve_folders(folders: Sequence[Path], out: Path | str, jobs: int | None = N
 
     summaries = Parallel(n_jobs=jobs)(
         delayed(solve)(name, folder) for name, folder in by_name.items())
-    table = drive_table(summaries).convert_dtypes().to_csv(index=False)
-    files.write_file(out / "drives.csv", table.encode())
+    table = StringIO()
+    writer = csv.DictWriter(table, COLUMNS, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(drive_rows(summaries))
+    files.write_file(out / "drives.csv", table.getvalue().encode())
     return summaries
 
 
-def drive_table(summaries: Sequence[dict]):
-    """The DataFrame over all drives, of `solve_folders`: a row for each problem, with COLUMNS.
+def drive_rows(summaries: Sequence[dict]) -> list[dict]:
+    """The rows of the table over all drives: a dict for each problem, with COLUMNS among its keys.
 
-    A problem or a drive that failed has a sentence; what is not known is NaN.
+    A problem or a drive that failed has a sentence; what is not known is absent.
     """
-    import pandas  # here, because it is the slowest import of all
-
     rows = []
     for summary in summaries:
         drive = {"dataset": summary["dataset"], "failed": summary.get("error")}
@@ -429,4 +472,4 @@ def drive_table(summaries: Sequence[dict]):
             rows.append(drive | row | {"problem": problem, "doubts": len(row["doubts"])})
         if not summary["problems"]:
             rows.append(drive)
-    return pandas.DataFrame(rows, columns=COLUMNS)
+    return rows
