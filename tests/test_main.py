@@ -71,6 +71,22 @@ def test_verbose_prints_decisions(folder):
     assert re.search(r"\nGTSAM: \d+ factors, \d+ variables, \d+ steps from ", told)
 
 
+def test_the_process_beside_solves_and_one_that_ends_is_replaced():
+    """In a process with a single thread."""
+    code = """if True:
+        import os
+        from slamlib.solve import _meanwhile
+        here = os.getpid()
+        def pid(ends):
+            if ends and os.getpid() != here:
+                os._exit(1)
+            return os.getpid()
+        print(*[_meanwhile(pid, ends)() == here for ends in (False, True)])
+        """
+    told = subprocess.run([sys.executable, "-c", code], text=True, capture_output=True)
+    assert told.stdout == f"{sys.platform != 'linux'} True\n"
+
+
 def test_results_are_not_written_into_a_dataset(folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     before = file_names(folder)
