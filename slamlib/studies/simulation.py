@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 from scipy.integrate import cumulative_simpson
+from scipy.spatial import KDTree
 
 from slamlib.core import se2
 from slamlib.core.odometry import dead_reckoning
@@ -248,7 +249,7 @@ def _place_markers(layout, poses, rng):
     place = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     place += spacing * rng.uniform(-0.35, 0.35, place.shape)
 
-    closest = distances(path[::10], place[:, None]).min(axis=1)
+    closest, _ = KDTree(path[::10]).query(place)
     gap = path[int(layout.gap_place * len(path))]
     outside_gap = distances(place, gap) > layout.gap_radius
     place = place[(closest < CAMERA_REACH) & outside_gap]
@@ -276,11 +277,13 @@ def _place_antennas(count, poses, rng):
 def _camera(truth, every, mislabelled, memory, noise, rng):
     """Sightings of all markers in the disc of CAMERA_REACH around every `every`-th pose."""
     frames = np.arange(0, len(truth.poses), every)
-    in_vehicle = se2.between(truth.poses[frames, None], truth.marker_in_world)
-    distance = np.hypot(in_vehicle[..., 0], in_vehicle[..., 1])
-    frame, marker = np.nonzero(distance < CAMERA_REACH)
-    true_z = in_vehicle[frame, marker]
-    covariance = _sighting_covariance(true_z, distance[frame, marker])
+    seen = KDTree(truth.marker_in_world[:, :2]).query_ball_point(
+        truth.poses[frames, :2], CAMERA_REACH, return_sorted=True)
+    frame = np.repeat(np.arange(len(frames)), [len(markers) for markers in seen])
+    marker = np.concatenate(seen).astype(int)
+    true_z = se2.between(truth.poses[frames[frame]], truth.marker_in_world[marker])
+    distance = np.hypot(true_z[:, 0], true_z[:, 1])
+    covariance = _sighting_covariance(true_z, distance)
     unit_error = _correlated(rng.standard_normal(true_z.shape), frame, marker, memory)
     error = np.linalg.cholesky(covariance) @ unit_error[..., None]
     z = true_z + noise * error[..., 0]
