@@ -17,7 +17,6 @@ from matplotlib.figure import Figure
 from nbformat import NotebookNode
 from nbformat.v4 import new_markdown_cell, new_notebook
 
-from slamlib.core import evaluation
 from slamlib.core.returns import find_returns
 from slamlib.core.vehicle import Vehicle
 from slamlib.io.dataset import read_vehicle
