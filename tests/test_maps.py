@@ -40,15 +40,15 @@ def drive(solved):
     return solved[0]
 
 
-def labels(fig):
-    return {text.get_text() for text in fig.legends[0].get_texts()}
+def labels(legend):
+    return {text.get_text() for text in legend.get_texts()}
 
 
 def test_maps_show_path_markers_antennas_guess_state_the_enlargement_and_share_a_legend(solved):
     drive, result = solved
     maps.whole_maps({drive: result})
     *_, fig, legend = map(plt.figure, plt.get_fignums())
-    assert labels(legend) == {"vehicle", "markers", "antennas: guess", "antennas: estimate"}
+    assert labels(legend.axes[0].get_legend()) == {"vehicle", "markers", "antennas: guess", "antennas: estimate"}
     assert not fig.legends
     ax, = fig.axes
     assert ax.get_title("left") == "short"
@@ -90,7 +90,7 @@ def test_what_a_drive_lacks_is_absent_from_map_and_tables(solved):
                for kind in ("marker", "antenna") for what in ("", "_in_world", "_covariance")}
     result = replace(result, **nothing)
     fig = maps.whole_map(drive, result)
-    assert labels(fig) == {"vehicle"}
+    assert labels(fig.legends[0]) == {"vehicle"}
     fig.draw_without_rendering()
     assert [*antenna_rows(result, drive)] == []
 

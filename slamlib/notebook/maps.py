@@ -27,8 +27,11 @@ def whole_maps(results: dict) -> None:
     for drive, result in results.items():
         entries |= plotting.legend_entries(whole_map(drive, result, legend=False))
     if entries:
-        lines = math.ceil(len(entries) * plotting.LABEL_WIDTH / WIDTH)
-        plotting.legend_below(plt.figure(figsize=(WIDTH, LEGEND * lines)), entries)
+        columns = int(WIDTH / plotting.LABEL_WIDTH)
+        lines = math.ceil(len(entries) / columns)
+        _, ax = plt.subplots(figsize=(WIDTH, LEGEND * lines))
+        ax.set_axis_off()
+        ax.legend(entries.values(), entries.keys(), loc="center", ncols=columns)
 
 
 def whole_map(drive, result, legend: bool = True) -> Figure:

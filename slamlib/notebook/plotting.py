@@ -250,10 +250,9 @@ def legend_entries(fig: Figure) -> dict:
             for handle, label in zip(*ax.get_legend_handles_labels())}
 
 
-def legend_below(fig: Figure, entries: dict | None = None) -> None:
-    """Draw one legend below all axes of a figure, by default with its `legend_entries`."""
-    if entries is None:
-        entries = legend_entries(fig)
+def legend_below(fig: Figure) -> None:
+    """Draw one legend below all axes of a figure: each label once."""
+    entries = legend_entries(fig)
     fig.legend(entries.values(), entries.keys(), loc="outside lower center",
                ncols=int(fig.get_figwidth() / LABEL_WIDTH))
 
