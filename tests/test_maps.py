@@ -48,7 +48,8 @@ def test_maps_show_path_markers_antennas_guess_state_the_enlargement_and_share_a
     drive, result = solved
     maps.whole_maps({drive: result})
     *_, fig, legend = map(plt.figure, plt.get_fignums())
-    assert labels(legend.axes[0].get_legend()) == {"vehicle", "markers", "antennas: guess", "antennas: estimate"}
+    assert labels(legend.axes[0].get_legend()) == {
+        "vehicle", "markers", "antennas: guess", "antennas: estimate"}
     assert not fig.legends
     ax, = fig.axes
     assert ax.get_title("left") == "short"
