@@ -29,7 +29,7 @@ def whole_maps(results: dict) -> None:
     if entries:
         columns = int(WIDTH / plotting.LABEL_WIDTH)
         lines = math.ceil(len(entries) / columns)
-        _, ax = plt.subplots(figsize=(WIDTH, LEGEND * lines))
+        _, ax = plt.subplots(figsize=(WIDTH, LEGEND * lines), layout="none")
         ax.set_axis_off()
         ax.legend(entries.values(), entries.keys(), loc="center", ncols=columns)
 
