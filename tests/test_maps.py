@@ -3,6 +3,7 @@
 from dataclasses import replace
 from itertools import combinations
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from matplotlib.collections import PolyCollection
@@ -39,15 +40,17 @@ def drive(solved):
     return solved[0]
 
 
-def labels(fig):
-    return {text.get_text() for text in fig.legends[0].get_texts()}
+def labels(legend):
+    return {text.get_text() for text in legend.get_texts()}
 
 
-def test_a_map_shows_path_markers_antennas_guess_truth_and_states_the_enlargement(solved):
+def test_maps_show_path_markers_antennas_guess_state_the_enlargement_and_share_a_legend(solved):
     drive, result = solved
-    fig = maps.whole_map(drive, result)
-    assert labels(fig) == {"vehicle", "truth", "markers", "markers: truth",
-                           "antennas: guess", "antennas: estimate", "antennas: truth"}
+    maps.whole_maps({drive: result})
+    *_, fig, legend = map(plt.figure, plt.get_fignums())
+    assert labels(legend.axes[0].get_legend()) == {
+        "vehicle", "markers", "antennas: guess", "antennas: estimate"}
+    assert not fig.legends
     ax, = fig.axes
     assert ax.get_title("left") == "short"
     assert ax.get_title("right").startswith("95 % ellipses × ")
@@ -83,12 +86,12 @@ def test_ellipses_of_poses_markers_and_antennas_are_contours_of_their_own_covari
 
 def test_what_a_drive_lacks_is_absent_from_map_and_tables(solved):
     drive, result = solved
-    drive = replace(drive, truth=None, dataset=drive.dataset.without("uwb"))
+    drive = replace(drive, dataset=drive.dataset.without("uwb"))
     nothing = {f"{kind}{what}": getattr(result, f"{kind}{what}")[:0]
                for kind in ("marker", "antenna") for what in ("", "_in_world", "_covariance")}
     result = replace(result, **nothing)
     fig = maps.whole_map(drive, result)
-    assert labels(fig) == {"vehicle"}
+    assert labels(fig.legends[0]) == {"vehicle"}
     fig.draw_without_rendering()
     assert [*antenna_rows(result, drive)] == []
 

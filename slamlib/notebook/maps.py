@@ -1,5 +1,7 @@
 """Draws the whole map of one drive with the names of its landmarks, which avoid each other."""
 
+import math
+
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
@@ -11,15 +13,29 @@ from slamlib.notebook import plotting
 
 HALF_WIDTH, WIDTH = 4.08, 7.4      # inches: half the width of the page, and all of it
 FLAT = 0.55                        # height of a map over its width, below which it needs all of it
-ABOVE_AND_BELOW = 0.8              # inches, for title, label and legend
+ABOVE_AND_BELOW = 0.55             # inches, for title and label
+LEGEND = 0.25                      # inches, height of a line of the legend
 # Places of a name relative to its landmark, in font sizes, in the order in which they are tried.
 NAME_OFFSETS = (1, 0.9), (-1, 0.9), (1, -0.9), (-1, -0.9)
 MOST_NAMES = 60                    # number of markers, beyond which the map names antennas only
 HALO = withStroke(linewidth=1.5, foreground="white")       # so that a name on the path can be read
 
 
-def whole_map(drive, result) -> Figure:
-    """The figure of a Drive's map: path, markers, antennas, their names, and truth if known.
+def whole_maps(results: dict) -> None:
+    """Draw figures of the maps of SlamResults by their Drive, and one of the legend they share."""
+    entries = {}
+    for drive, result in results.items():
+        entries |= plotting.legend_entries(whole_map(drive, result, legend=False))
+    if entries:
+        columns = int(WIDTH / plotting.LABEL_WIDTH)
+        lines = math.ceil(len(entries) / columns)
+        _, ax = plt.subplots(figsize=(WIDTH, LEGEND * lines), layout="none")
+        ax.set_axis_off()
+        ax.legend(entries.values(), entries.keys(), loc="center", ncols=columns)
+
+
+def whole_map(drive, result, legend: bool = True) -> Figure:
+    """The figure of a Drive's map: path, markers, antennas, and their names.
 
     `result` is a SlamResult. Ellipses hold 95 %; the title states how much they are enlarged, which
     is `plotting.enlargement` of the vehicle's. A question mark stands at the names of antennas in
@@ -30,28 +46,23 @@ def whole_map(drive, result) -> Figure:
     landmarks = np.concatenate([result.marker_in_world[:, :2], result.antenna_in_world])
     fig, ax = plt.subplots(figsize=_size(np.concatenate([result.poses[:, :2], landmarks])))
     ax.set_title(drive.name)
-    truth = drive.truth
     role = "slam_uwb" if len(result.antenna) else "slam"
     enlarged = plotting.enlargement(result.poses, result.covariances)
-    if truth is not None:                                    # below the path, which covers it
-        plotting.trajectory(ax, truth.poses, "truth", linewidth=3.5, linestyle="-", alpha=0.25)
     plotting.with_ellipses(ax, result.poses, result.covariances, role, "vehicle", enlarged,
                            count=24)
     if len(result.marker):
         plotting.ellipses(ax, result.marker_in_world, result.marker_covariance,
                           plotting.ROLES["aruco"]["color"], enlarged=enlarged)
         plotting.landmarks(ax, result.marker_in_world, "marker", "markers")
-        if truth is not None:
-            plotting.landmarks(ax, truth.marker_in_world, "true place", "markers: truth")
     if len(result.antenna):
         guess = drive.dataset.antenna_guess
         guess = plotting.places_by_id(guess.antenna, guess.position, result.antenna)
         in_doubt = np.isin(result.antenna, list(result.doubts))
         sure = np.where(in_doubt[:, None, None], 0, result.antenna_covariance)
         plotting.draw_antennas(ax, result.antenna_in_world, sure, guess, enlarged)
-        if truth is not None:
-            plotting.landmarks(ax, truth.antenna_in_world, "true place", "antennas: truth")
-    plotting.legend_below(fig)
+    if legend:
+        fig.set_figheight(fig.get_figheight() + LEGEND)
+        plotting.legend_below(fig)
     fig.draw_without_rendering()                                  # fixes the axes for the names
     taken = []
     signs = ax.transData.transform(landmarks)

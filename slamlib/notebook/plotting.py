@@ -54,6 +54,7 @@ ROLES = {
 STYLE = Path(__file__).with_name("slamlib.mplstyle")  # for matplotlib.style
 MAX_SEMI_AXIS = 0.04         # of enlarged 95 % ellipses, in the larger extent of the path
 MAX_BANDS = 800              # poses at which errors are drawn
+LABEL_WIDTH = 1.8            # inches, of a label in a legend
 
 
 class Estimates(NamedTuple):
@@ -243,12 +244,17 @@ def evenly(poses: np.ndarray, count: int) -> np.ndarray:
     return known[::-step]
 
 
+def legend_entries(fig: Figure) -> dict:
+    """What a legend of a figure shows by its label, each once."""
+    return {label: handle for ax in fig.axes
+            for handle, label in zip(*ax.get_legend_handles_labels())}
+
+
 def legend_below(fig: Figure) -> None:
     """Draw one legend below all axes of a figure: each label once."""
-    entries = {label: handle for ax in fig.axes
-               for handle, label in zip(*ax.get_legend_handles_labels())}
+    entries = legend_entries(fig)
     fig.legend(entries.values(), entries.keys(), loc="outside lower center",
-               ncols=int(fig.get_figwidth() / 1.8))          # inches, of a label
+               ncols=int(fig.get_figwidth() / LABEL_WIDTH))
 
 
 def curve(ax: Axes, values: np.ndarray, role: str, frame: np.ndarray, label: str | None = None,

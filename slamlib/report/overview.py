@@ -4,6 +4,7 @@ The text is in the template overview.md. All numbers are those of the results of
 files and `summary.json`.
 """
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,11 +12,11 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 from IPython.core.pylabtools import print_figure
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from nbformat import NotebookNode
 from nbformat.v4 import new_markdown_cell, new_notebook
 
-from slamlib.core import evaluation
 from slamlib.core.returns import find_returns
 from slamlib.core.vehicle import Vehicle
 from slamlib.io.dataset import read_vehicle
@@ -26,7 +27,6 @@ from slamlib.report.document import address
 from slamlib.report.notebooks import rendered
 from slamlib.solve import PROBLEMS, SENSORS, VEHICLE_ESTIMATED, Solution
 
-DRAWN = "problem1", "problem2_fused"  # whose trajectories figure 1 has, beside the last one
 # Columns of the table of results, in thousandths of these entries of a summary.
 COLUMNS = {"ATE (mm)": "ate_m", "aligned (mm)": "ate_aligned_m", "at returns (mm)": "at_returns_m",
            "σ (mm)": "median_sigma_m", "σ of δ (mrad)": "median_sigma_heading_rad"}
@@ -60,7 +60,7 @@ def opening(drives: list[SolvedDrive]) -> NotebookNode:
     """Return the opening of the report, an executed notebook, of drives as `read_drives` sorts."""
     solved = [drive for drive in drives if drive.solutions]
     longest = without_stand_ins(solved)[-1] if solved else None
-    drawn = trajectories(longest) if longest else ""
+    drawn = pictures(longest) if longest else ""
     rows = [row for drive in drives for row in result_rows(drive)]
     text = rendered(
         "overview.md", drives=drives, longest=longest, plain=plain, sensors=SENSORS,
@@ -112,27 +112,32 @@ def differences_at_returns(drive: SolvedDrive) -> dict[str, float]:
 
 
 @plt.style.context(plotting.STYLE, after_reset=True)
-def trajectories(drive: SolvedDrive) -> str:
-    """Return the figure of a drive's trajectories, its last map and sigmas, as SVG."""
-    fig = Figure(figsize=(7.2, 2.6))  # inches
-    left, right = fig.subplots(1, 2, width_ratios=(2, 3))
-    last = drive.solutions[-1]
-    for name, role, size in (("ArucoMap", "marker", 1), ("UwbMap", "antenna", 5)):
-        if name in last.maps:
-            look = plotting.ROLES[role] | {"markersize": size}
-            left.plot(*last.maps[name][1].T[:2], label=f"{role}s", **look)
-    for solution in drive.solutions:
+def pictures(drive: SolvedDrive) -> str:
+    """Return the figure of a drive's last map and of the errors of all its problems, as SVG."""
+    fig = Figure(figsize=(7.2, 2.9))  # inches
+    left, right = fig.subfigures(1, 2, width_ratios=(2, 3.4))
+    draw_map(left.subplots(), drive.solutions[-1])
+    columns = min(3, len(drive.solutions))
+    lines = math.ceil(len(drive.solutions) / columns)
+    panels = right.subplots(lines, columns, squeeze=False, sharex=True)
+    for ax, solution in zip(panels.flat, drive.solutions):
         title, _, role = PROBLEMS[solution.problem]
-        if solution.problem in DRAWN or solution is last:
-            # Curves that coincide are all seen, since later ones are thinner.
-            look = {"linewidth": 3.5, "linestyle": "-"} if solution is last else {"zorder": 3.1}
-            plotting.trajectory(left, solution.poses, role, "_", **look)
-        sigmas = evaluation.position_sigmas(solution.covariances)
-        known = np.flatnonzero(sigmas > np.nanmax(sigmas) / 1000)  # on a logarithmic axis
-        plotting.curve(right, sigmas[known], role, known, title)
-    if drive.truth is not None:
-        plotting.trajectory(left, drive.truth.poses, "truth", linewidth=0.6, linestyle="-",
-                            zorder=3.2)
-    right.set(xlabel="pose id", yscale="log", ylabel="σ of position (m)")
+        plotting.errors([ax], solution, drive, role)
+        number = solution.problem.removeprefix("problem")[0]
+        ax.set_title(f"{number}. {title}", fontsize=7.5, fontweight="normal")
+        ax.set(xlabel="", ylabel="")
+    for ax in panels.flat[len(drive.solutions):]:
+        ax.remove()
+    right.supxlabel("pose id", fontsize=9)
     plotting.legend_below(fig)
     return print_figure(fig, "svg", metadata={"Date": None})
+
+
+def draw_map(ax: Axes, solution: Solution) -> None:
+    """Draw the trajectory of a Solution, and the landmarks that it has."""
+    for name, role, size in (("ArucoMap", "marker", 1.5), ("UwbMap", "antenna", 5)):
+        if name in solution.maps:
+            look = plotting.ROLES[role] | {"markersize": size}
+            ax.plot(*solution.maps[name][1].T[:2], label=f"{role}s", **look)
+    _, _, role = PROBLEMS[solution.problem]
+    plotting.trajectory(ax, solution.poses, role, "vehicle", linewidth=1.2, linestyle="-")
