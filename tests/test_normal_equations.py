@@ -6,16 +6,13 @@ import numpy as np
 import pytest
 from numeric import as_points, known_noise, short
 from numpy.testing import assert_allclose
-from scipy.linalg import block_diag
 from scipy.special import chdtri
 
 from slamlib.core import sightings
 from slamlib.core.errors import DatasetError
 from slamlib.core.kernels import KERNELS
-from slamlib.core.se2 import sigmas
-from slamlib.robust import linear, noise
-from slamlib.robust.calibration import ENTRIES, WHEEL_SCALE
-from slamlib.robust.covariances import marginal_covariances
+from slamlib.robust import linear
+from slamlib.robust.calibration import ENTRIES
 from slamlib.robust.initialization import odometry_state
 from slamlib.robust.linear import NormalEquations, build_problem, laplace_approximation
 from slamlib.robust.measurements import WEAK_SIGMA, Noise, _structure, accept_all, measure
@@ -63,66 +60,6 @@ def test_markers_without_accepted_sightings_have_a_weak_prior_and_nothing_else()
     for j in np.flatnonzero(lost):
         own = m.structure.rows[len(m.frame) + j, :2 + m.oriented[j]]
         assert_allclose(H[own], np.eye(len(H))[own] / WEAK_SIGMA**2)
-
-
-@pytest.mark.parametrize("poses", [1, 15, 400])
-def test_selected_blocks_are_those_of_the_dense_inverse(poses):
-    """Of one frame, of two, and of many; there also a point, and free offsets of the ranges."""
-    m = measure(with_a_point(poses))
-    given = Noise(2e-3, 1.5, 0.7)
-    problem = released(build_problem(m, "arc"), {"range-offset", WHEEL_SCALE} if poses > 1 else ())
-    equations = NormalEquations(problem, odometry_state(m, "arc"))
-    found = marginal_covariances(equations, given)
-    information = dense_information(m.structure, equations.sums(given))
-    active = problem.active
-    n = len(information) - np.count_nonzero(active)
-    assert_allclose(information, information.T, rtol=1e-9, atol=1e-6)
-    unit = block_diag(np.eye(n), problem.prior.of(slice(None))[active])
-    expected = unit @ np.linalg.inv(information) @ unit.T
-    sigma = sigmas(expected)
-    assert not found.c[~active].any() and not found.c[:, ~active].any()
-
-    def check(at, blocks):
-        scale = sigma[at][:, :, None] * sigma[at][:, None]
-        assert_allclose(
-            blocks / scale, expected[at[:, :, None], at[:, None]] / scale, atol=1e-6)
-
-    frames, landmarks = np.split(m.structure.rows, [len(m.frame)])
-    wheels = np.tile(np.arange(n, n + 3), (len(found.pairs), 1))
-    check(np.concatenate([frames[:-1], frames[1:], wheels], axis=1), found.pairs)
-    check(landmarks, found.landmarks)
-    check(np.arange(n, len(unit))[None], found.c[np.ix_(active, active)][None])
-
-
-def posterior_points(monkeypatch, C):
-    """Weights (p,) and logarithms (p, 3) of the points of a normal posterior about CENTRE."""
-    information = np.linalg.inv(C)
-    monkeypatch.setattr(noise, "_log_posterior",
-                        lambda _, x: -(x - CENTRE) @ information @ (x - CENTRE) / 2)
-    posterior = noise.NoisePosterior(Noise(*np.exp(CENTRE)), C, 0.0)
-    weights, noises = zip(*noise.points_of(None, posterior))
-    return np.array(weights), np.log(noises)
-
-
-CENTRE = np.log([2e-3, 1.3, 0.8])
-BROAD = np.array([[0.25, 0.06, 0.0], [0.06, 0.04, 0.01], [0.0, 0.01, 0.09]])
-
-
-def test_points_of_the_posterior_have_its_moments(monkeypatch):
-    """Along the slip by points, across by a wider noise: log-normal root mean squares."""
-    weights, logs = posterior_points(monkeypatch, BROAD)
-    assert len(weights) == 5 and np.isclose(sum(weights), 1)
-    rest = np.diag(BROAD) - BROAD[0]**2 / BROAD[0, 0]           # given the slip
-    assert_allclose(weights @ logs, CENTRE + rest, atol=1e-6)
-    spread = logs - CENTRE - rest
-    assert_allclose((weights * spread.T) @ spread,
-                               np.outer(BROAD[0], BROAD[0]) / BROAD[0, 0], rtol=0.02, atol=1e-12)
-
-
-def test_a_narrow_posterior_is_one_point(monkeypatch):
-    weights, logs = posterior_points(monkeypatch, 0.01 * BROAD)
-    assert weights.tolist() == [1]
-    assert_allclose(logs[0], CENTRE + 0.01 * np.diag(BROAD), rtol=1e-12)
 
 
 def test_gates_are_quantiles_of_chi_squared():

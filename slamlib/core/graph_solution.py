@@ -79,15 +79,21 @@ class Marginals:
 
     def joint(self, first: int, second: int) -> np.ndarray:
         """The covariance (d, e) between two variables."""
+        size = len(self.covariance(first))
+        return self.pair(first, second)[:size, size:]
+
+    def pair(self, first: int, second: int) -> np.ndarray:
+        """The covariance (d + e, d + e) of two variables."""
+        keys = [first, second]
         try:
-            return self.tree.jointMarginalCovariance([first, second]).at(first, second)
+            joint = self.tree.jointMarginalCovariance(keys)
+            return np.block([[joint.at(row, column) for column in keys] for row in keys])
         except RuntimeError:
             ordering = gtsam.Ordering()
             ordering.push_back(first)
             ordering.push_back(second)
             root, _ = self.tree.joint(first, second, gtsam.EliminateQR).jacobian(ordering)
-            size = len(self.covariance(first))
-            return covariance_of_root(np.linalg.qr(root, mode="r"), first)[:size, size:]
+            return covariance_of_root(np.linalg.qr(root, mode="r"), first)
 
 
 def covariance_of_root(root: np.ndarray, key: int) -> np.ndarray:

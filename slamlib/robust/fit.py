@@ -10,7 +10,6 @@ have memory, measurements keep a share of their information (`slamlib.robust.err
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from gtsam import noiseModel
@@ -20,7 +19,7 @@ from slamlib.core.sightings import GATE, MEDIAN_CHI2, POINT_GATE
 from slamlib.robust.calibration import WHEELS
 from slamlib.robust.error_memory import Memory, error_memory
 from slamlib.robust.factors import linearize_measurements, preintegrate_odometry
-from slamlib.robust.linear import NormalEquations, Problem, State, laplace_approximation
+from slamlib.robust.linear import Problem, State, laplace_approximation
 from slamlib.robust.measurements import (
     Accepted,
     AcceptedMeasurements,
@@ -28,7 +27,7 @@ from slamlib.robust.measurements import (
     accept_all,
     with_known,
 )
-from slamlib.robust.noise import NoisePosterior, learn_noise, points_of, with_hidden_errors
+from slamlib.robust.noise import NoisePosterior, learn_noise, with_hidden_errors
 from slamlib.robust.optimize import optimize
 
 log = logging.getLogger(__name__)
@@ -164,15 +163,6 @@ class Fit:
         """Log posterior density of the noise, or log evidence if all of it is known."""
         return self.log_evidence if self.posterior is None else self.posterior.log_density
 
-    @cached_property
-    def noise_points(self) -> tuple[tuple[float, Noise], ...]:
-        """Probability and Noise of each point over which estimates are averaged."""
-        if self.posterior is None:
-            return ((1.0, self.problem.noise),)
-        equations = NormalEquations(self.problem, self.state)
-        return tuple((probability, _with_hidden(self.problem, noise))
-                     for probability, noise in points_of(equations, self.posterior))
-
 
 def refine(problem: Problem, state: State,
            accept: Callable[..., AcceptedMeasurements] | None = accepted_measurements) -> Fit:
@@ -272,18 +262,22 @@ def _settle_noise(problem, state):
 
 
 def settled(fit: Fit) -> Fit:
-    """The Fit with odometry linearised at its own wheels, for the same measurements and noise.
+    """The Fit with the mean of the noise's posterior, and odometry linearised at its own wheels.
 
-    Rounds that end after MAX_ROUNDS leave it linearised elsewhere, where increments have other
-    scales.
+    For the same measurements. Rounds that end after MAX_ROUNDS leave odometry linearised elsewhere,
+    where increments have other scales.
     """
+    problem = fit.problem
+    if fit.posterior is not None:
+        problem = replace(problem, noise=_with_hidden(problem, fit.posterior.mean))
+    state = fit.state
     for _ in range(MAX_ROUNDS):
-        if _wheel_move(fit.problem, fit.state) < SETTLED_MOVE:
+        optimum = optimize(problem, state)
+        state = optimum.state
+        if _wheel_move(problem, state) < SETTLED_MOVE:
             break
-        problem = _with_errors_in_counts(_relinearized(fit.problem, fit.state))
-        optimum = optimize(problem, fit.state)
-        fit = replace(fit, problem=problem, state=optimum.state, converged=optimum.converged)
-    return fit
+        problem = _with_errors_in_counts(_relinearized(problem, state))
+    return replace(fit, problem=problem, state=state, converged=optimum.converged)
 
 
 def _accepted_with_memory(problem, state, accept):

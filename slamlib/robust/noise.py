@@ -3,9 +3,8 @@
 All three are log-normal a priori, with medians of 1 mm after one metre and of 1, and standard
 deviations of a factor of 3 and of 2. The evidence times this prior is the posterior of the
 logarithms of slip and factors. Newton's method finds its mode, differences give its covariance.
-Poses and landmarks are averaged over a few points of it (integrated nested Laplace approximation:
-Rue, Martino and Chopin, J. R. Stat. Soc. B 71(2), 2009), so that the covariances include that the
-slip is uncertain.
+The solution is that for the mean of this posterior, so that the covariances include that the noise
+is uncertain.
 """
 
 import logging
@@ -33,9 +32,6 @@ MAX_STEP = 1.5               # of a logarithm, longest step of Newton's method
 SHORTEST_STEP = 0.1          # sigmas, to which a step that does not ascend is halved
 MAX_NEWTON_STEPS = 12        # number of steps of Newton's method
 CONVERGED_GAIN = 0.01        # log posterior gained by Newton's last step, beside what it predicts
-POINT_OFFSETS = 1.5 * np.arange(-2, 3)       # sigmas of log slip, points of the average
-SINGLE_POINT_SIGMA = 0.2     # of log slip, below which the mode alone is enough
-MIN_POINT_WEIGHT = 1e-3      # probability of a point; less probable ones are left out
 SINGULAR = -1e12             # log evidence of noise for which the equations are singular
 
 POOR_FACTOR = 1.5            # of sightings, above which errors may be shared
@@ -67,6 +63,11 @@ class NoisePosterior:
     noise: Noise                 # the mode
     covariance: np.ndarray       # (3, 3) of its logarithms, 0 for parameters that are not learned
     log_density: float           # log posterior at the mode, up to a constant
+
+    @property
+    def mean(self) -> Noise:
+        """The Noise exp(mu + s^2 / 2) of log-normal parameters of the mode exp(mu)."""
+        return _noise_of(np.log(self.noise) + np.diag(self.covariance) / 2)
 
 
 def learn_noise(equations: NormalEquations) -> NoisePosterior:
@@ -164,27 +165,3 @@ def _inverse_curvature(curvature):
     """Inverse (p, p) of a symmetric matrix, in no direction above the widest prior's variance."""
     values, axes = np.linalg.eigh(curvature)
     return axes / np.maximum(values, PRIOR_SIGMA.max()**-2) @ axes.T
-
-
-def points_of(equations: NormalEquations,
-              posterior: NoisePosterior) -> tuple[tuple[float, Noise], ...]:
-    """Probability and Noise of each point of a NoisePosterior over which estimates are averaged.
-
-    They lie along the slip, each with the most probable factors, by NormalEquations at the
-    solution. Each point has the root mean square exp(mu + s^2) of its log-normal noise parameters.
-    """
-    mode = np.log(posterior.noise)
-    covariance = posterior.covariance
-    sigma = np.sqrt(covariance[0, 0])
-    if sigma < SINGLE_POINT_SIGMA:                       # 0 where the slip is known
-        return ((1.0, _noise_of(mode + np.diag(covariance))),)
-    direction = covariance[0] / sigma                    # (3,) for one sigma of log slip
-    log_density = np.array([_log_posterior(equations, mode + offset * direction)
-                            for offset in POINT_OFFSETS])
-    weight = np.exp(log_density - log_density.max())
-    weight /= weight.sum()
-    remaining = covariance - np.outer(direction, direction)      # given the slip
-    variance = np.maximum(np.diag(remaining), 0)
-    return tuple((probability, _noise_of(mode + offset * direction + variance))
-                 for offset, probability in zip(POINT_OFFSETS, weight.tolist())
-                 if probability > MIN_POINT_WEIGHT)

@@ -31,7 +31,6 @@ from slamlib.robust.linear import Problem, build_problem
 from slamlib.robust.measurements import Measurements, Noise, measure
 from slamlib.robust.part_faults import mended
 from slamlib.robust.result import SlamResult, slam_result
-from slamlib.robust.solution import solve_by_gtsam
 
 log = logging.getLogger(__name__)
 
@@ -112,11 +111,11 @@ def estimate(dataset: Dataset, slip: float | None = None, model: str | None = No
     else:
         fit, places = most_consistent(dataset, start, decide)
     fit = settled(fit)
-    by_gtsam = solve_by_gtsam(fit)
-    result = replace(slam_result(fit, by_gtsam), places=places)                       # 7
+    result = replace(slam_result(fit), places=places)                                 # 7
+    solution = result.gtsam
     log.info("GTSAM: %d factors, %d variables, %d steps from %s, differs by up to %.2g sigmas",
-             by_gtsam.factors, by_gtsam.variables, by_gtsam.steps, by_gtsam.start,
-             result.agreement[0])
+             solution.factors, solution.variables, solution.steps, solution.start,
+             result.disagreement)
     log.info("estimate of %s: %.1f s", dataset.name, time.perf_counter() - started)
     return result
 

@@ -4,9 +4,8 @@ Encoder poses between the frames are conditioned on both neighbouring frames (`i
 Antennas whose position the ranges do not determine are in doubt, and their covariances include it.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from operator import attrgetter
-from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -15,7 +14,7 @@ from slamlib.core import increments, se2
 from slamlib.core.graph import GUESS_PRIOR_SIGMA
 from slamlib.core.increments import odometry_noise
 from slamlib.robust.calibration import WHEELS, calibration_table
-from slamlib.robust.covariances import posterior_moments
+from slamlib.robust.factors import inverse_adjoint
 from slamlib.robust.fit import Fit, error_memories, residuals
 from slamlib.robust.initialization import (
     SAME_PLACE,
@@ -26,7 +25,13 @@ from slamlib.robust.initialization import (
     trilaterate,
 )
 from slamlib.robust.linear import Problem, State
-from slamlib.robust.solution import GtsamSolution, graph_of, places_of, solved_noise, values_of
+from slamlib.robust.solution import (
+    GtsamSolution,
+    graph_of,
+    places_of,
+    solve_by_gtsam,
+    values_of,
+)
 
 MIN_ACCEPTED_RANGES = 5      # number of accepted ranges of an antenna that is not in doubt
 SAME_MARKER = 0.05           # m, distance of two markers that must be one
@@ -57,8 +62,8 @@ class SlamResult:
     correlation: tuple              # of neighbours' residuals of a marker, and of an antenna
     turn_sigma: np.ndarray          # (f-1,) rad, of odometry's turns between frames, stated wheels
     fit: Fit                        # what was decided, and by which solution
-    gtsam: GtsamSolution | None     # what is handed in; None while the engine decides
-    agreement: tuple[float, float]  # of both: largest difference, sigmas; relative of sigmas
+    gtsam: GtsamSolution            # what is handed in
+    disagreement: float             # largest difference of both, sigmas
     places: np.ndarray | None = None     # (m, 2) ids of ArucoReadings, and those in the map
 
     # Parts of the fit
@@ -77,7 +82,7 @@ class SlamResult:
     @property
     def converged(self) -> bool:
         """Whether the error had stopped to fall where the last iterations ended."""
-        return (self.gtsam or self.fit).converged
+        return self.gtsam.converged
 
     @property
     def calibration_table(self) -> list[dict]:
@@ -98,12 +103,11 @@ class SlamResult:
     def graph(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
         """The gtsam.NonlinearFactorGraph that was decided, and gtsam.Values at its solution.
 
-        For factors of one's own, and GTSAM's own tools; `core.graph` has the keys. Nothing is
-        averaged over the noise. `core.graph_solution.solve_graph` solves it.
+        For factors of one's own, and GTSAM's own tools; `core.graph` has the keys.
+        `core.graph_solution.solve_graph` solves it.
         """
-        graph = graph_of(self.fit.problem, solved_noise(self.fit))
-        mode = self.fit.state if self.gtsam is None else self.gtsam.mode
-        return graph, values_of(self.fit.problem, mode, graph)
+        graph = graph_of(self.fit.problem)
+        return graph, values_of(self.fit.problem, self.gtsam.state, graph)
 
     @property
     def unconfirmed(self) -> np.ndarray:
@@ -119,30 +123,16 @@ class SlamResult:
         return self.marker[(count == 1) | doubled.any(axis=1)]
 
 
-class _Engine(NamedTuple):
-    """The engine's solution, with the fields of a GtsamSolution that a result needs."""
+def slam_result(fit: Fit) -> SlamResult:
+    """The SlamResult of a Fit, by GTSAM's solution of its graph.
 
-    state: State
-    frames: np.ndarray           # (f, 3, 3)
-    landmarks: np.ndarray        # (k + a, 3, 3)
-    c: np.ndarray                # (p, p)
-
-
-def slam_result(fit: Fit, by_gtsam: GtsamSolution | None = None) -> SlamResult:
-    """The SlamResult of a Fit, with the GtsamSolution of its graph or, without one, the engine's.
-
-    Cross-covariances of neighbouring frames, by which encoder poses between them follow, are the
-    engine's. Raises LinAlgError as `marginal_covariances`.
+    Raises DatasetError where the measurements do not determine every variable.
     """
     problem = fit.problem
     m = problem.measurements
-    state, marginal, slip = posterior_moments(fit)
-    engine = _Engine(state, _of_frames(marginal.pairs, m), marginal.landmarks, marginal.c)
-    solution = by_gtsam or engine
+    solution = solve_by_gtsam(fit)
     state = solution.state
-    averaged = replace(problem, noise=problem.noise._replace(slip=slip))
-    poses, covariances = interpolate(averaged, state, marginal.pairs)
-    covariances[m.frame] = se2.rotate_covariance(solution.frames, state.poses[:, 2])
+    poses, covariances = interpolate(problem, solution)
 
     rejected = problem.accepted.sightings.weight == 0
     mapped = _mostly_accepted(m, rejected)
@@ -160,7 +150,6 @@ def slam_result(fit: Fit, by_gtsam: GtsamSolution | None = None) -> SlamResult:
     if fit.posterior is not None:
         noise_sigma = np.sqrt(np.diag(fit.posterior.covariance))
     memories = error_memories(problem, state)
-    few_ranges = np.bincount(m.ranges.antenna) < MIN_ACCEPTED_RANGES
     return SlamResult(
         poses=poses, covariances=covariances,
         marker=m.marker[mapped], marker_in_world=markers,
@@ -169,8 +158,8 @@ def slam_result(fit: Fit, by_gtsam: GtsamSolution | None = None) -> SlamResult:
         doubts=doubts, c=state.c, c_covariance=solution.c, noise_sigma=noise_sigma,
         rejected=rejected, range_weight=range_weight, range_residual=range_residual,
         correlation=tuple(memory.correlation for memory in memories),
-        turn_sigma=turn_sigma(problem), fit=fit, gtsam=by_gtsam,
-        agreement=_agreement(solution, engine, few_ranges))
+        turn_sigma=turn_sigma(problem), fit=fit, gtsam=solution,
+        disagreement=_difference_from(fit, solution))
 
 
 def _mostly_accepted(measurements, rejected):
@@ -189,35 +178,20 @@ def _with_sighted_headings(measurements, covariances):
     return covariances
 
 
-def _of_frames(pairs, measurements):
-    """Covariances (f, 3, 3) of the frames by those of pairs (f-1, 9, 9); of one alone its prior."""
-    if not len(pairs):
-        return np.diag(measurements.origin_sigma**2)[None]
-    return np.concatenate([pairs[:, :3, :3], pairs[-1:, 3:6, 3:6]])
+def _difference_from(fit, solution):
+    """Largest difference of a GtsamSolution from the solution of a Fit, in its own sigmas.
 
-
-def _agreement(solution, engine, few_ranges):
-    """Largest difference of poses and landmarks of a solution from the engine's, in its sigmas.
-
-    Also the largest relative difference of their sigmas. Antennas with `few_ranges` (a,) are left
-    out: these hardly determine them.
+    Antennas with few ranges, which hardly determine them, are left out.
     """
-    variances = _variances(solution)
-    in_both = variances > 0
-    of_antennas = in_both[len(in_both) - len(few_ranges):]
-    of_antennas[few_ranges] = False
-    sigma = np.sqrt(_variances(engine)[in_both])
-    difference = se2.between(places_of(engine.state), places_of(solution.state))
-    difference[:, 2] = se2.wrap(difference[:, 2])
-    off = np.abs(difference[in_both]) / sigma
-    ratio = np.abs(np.sqrt(variances[in_both]) / sigma - 1)
-    return float(off.max(initial=0.0)), float(ratio.max(initial=0.0))
-
-
-def _variances(solution):
-    """Variances (f + k + a, 3) of a solution, of poses and markers in their own axes."""
+    antenna_count = np.bincount(fit.problem.measurements.ranges.antenna)
     blocks = np.concatenate([solution.frames, solution.landmarks])
-    return np.diagonal(blocks, axis1=1, axis2=2)
+    variances = np.diagonal(blocks, axis1=1, axis2=2)
+    known = variances > 0
+    known[len(known) - len(antenna_count):][antenna_count < MIN_ACCEPTED_RANGES] = False
+    difference = se2.between(places_of(fit.state), places_of(solution.state))
+    difference[:, 2] = se2.wrap(difference[:, 2])
+    off = np.abs(difference[known]) / np.sqrt(variances[known])
+    return float(off.max(initial=0.0))
 
 
 def turn_sigma(problem: Problem) -> np.ndarray:
@@ -329,22 +303,30 @@ def _from_frame(problem, state, row, pose, is_after):
         jump=m.jumps.share(start, end).sum(axis=1)[:, None, None])
 
 
-def interpolate(problem: Problem, state: State,
-                pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def interpolate(problem: Problem, solution: GtsamSolution) -> tuple[np.ndarray, np.ndarray]:
     """Every encoder pose (n, 3) and its covariance (n, 3, 3) in world axes, given the frames.
 
     A pose k between the frames a and b depends only on them and on the wheels w. X_a Delta_ak(w)
     and X_b Delta_kb(w)^-1 are two estimates of it, with independent noise of the encoder steps
     before and after it. Their average by information is the conditional mean, exact to first order.
-
-    `pairs` (f-1, 9, 9) as in `Covariances`, at the State that solves the Problem.
+    Its covariance is that of X_a and of the motion from there to X_b, whose errors are far smaller
+    where a and b err alike. That the wheels correlate with both is neglected: they hardly matter
+    between two poses that are known.
     """
     m = problem.measurements
-    joint = _pairs_in_world(pairs, state.poses[:, 2])
+    state = solution.state
+    frames = solution.frames
+    to_world = np.tile(np.eye(3), (len(frames), 1, 1))
+    to_world[:, :2, :2] = se2.rotation(state.poses[:, 2])
+    own, both = np.split(solution.pairs[:, :3], 2, axis=2)
+    adjoint = inverse_adjoint(se2.between(state.poses[:-1], state.poses[1:]))
+    with_motion = both - own @ adjoint.mT                # of X_a and of X_a^-1 X_b
+    of_motion = solution.pairs[:, 3:, 3:] - adjoint @ both - with_motion.mT @ adjoint.mT
+    wheels = solution.c[WHEELS, WHEELS]
     pose = np.arange(len(m.dataset.ticks))
     last = np.searchsorted(m.frame, pose, side="right") - 1      # frame at each pose or before it
     poses = state.poses[last]
-    covariances = _of_frames(joint, m)[last]
+    covariances = (to_world @ frames @ to_world.mT)[last]
 
     inner = np.setdiff1d(pose, m.frame)
     a = last[inner]
@@ -357,18 +339,13 @@ def interpolate(problem: Problem, state: State,
     N_b = after.noise + after.jump * jump
     gain_b = N_a @ np.linalg.inv(N_a + N_b)
     gain_a = np.eye(3) - gain_b
-    by_pair = np.concatenate([
-        gain_a @ before.by_frame, gain_b @ after.by_frame,
-        gain_a @ before.by_wheel + gain_b @ after.by_wheel], axis=2)
     poses[inner] = before.pose + np.einsum("nij,nj->ni", gain_b, difference)
-    covariances[inner] = by_pair @ joint[a] @ by_pair.mT + gain_a @ N_a
+    since_a = se2.between(state.poses[a], poses[inner])
+    by_a = se2.compose_jacobians(state.poses[a], since_a)[0] @ to_world[a]
+    by_motion = gain_b @ after.by_frame @ to_world[a + 1]
+    by_wheel = gain_a @ before.by_wheel + gain_b @ after.by_wheel
+    common = by_a @ with_motion[a] @ by_motion.mT
+    covariances[inner] = (
+        by_a @ own[a] @ by_a.mT + common + common.mT + by_motion @ of_motion[a] @ by_motion.mT
+        + by_wheel @ wheels @ by_wheel.mT + gain_a @ N_a)
     return poses, (covariances + covariances.mT) / 2
-
-
-def _pairs_in_world(pairs, heading):
-    """Covariances (f-1, 9, 9) of pairs of frames with headings (f,) and wheels, in world axes."""
-    R = se2.rotation(heading)
-    turn = np.tile(np.eye(9), (len(pairs), 1, 1))
-    turn[:, :2, :2] = R[:-1]
-    turn[:, 3:5, 3:5] = R[1:]
-    return turn @ pairs @ turn.mT

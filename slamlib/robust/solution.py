@@ -6,17 +6,13 @@ are the variable S(0), in standard deviations from what is stated. Those of the 
 Gauss-Newton starts from problem 1's odometry. Where it does not converge from there in a few steps,
 or ends at a larger error than that of the engine's solution, it starts again from this solution.
 
-With probability p_k of point k of the noise's posterior, x_k its solution and C_k its covariance,
-poses and landmarks have the moments (equation 3.8)
-
-    x = sum p_k x_k,    C = sum p_k (C_k + (x_k - x) (x_k - x)^T),
-
-in the tangent space at the solution of greatest posterior density. The engine computes the same in
-numpy (`robust.covariances`); how far both are apart is part of the result.
+Covariances are GTSAM's marginals; those of neighbouring frames together are what encoder poses
+between them follow from. How far the engine's solution is from GTSAM's is part of the result.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import gtsam
 import numpy as np
@@ -32,9 +28,7 @@ from slamlib.core.graph import (
 )
 from slamlib.core.graph_solution import (
     CONVERGED,
-    GaussNewton,
     Marginals,
-    eliminated,
     gauss_newton,
 )
 from slamlib.core.kernels import ONE_SIDED_BIAS, symmetric
@@ -52,7 +46,6 @@ from slamlib.robust.factors import delayed, range_error, sighting_error
 from slamlib.robust.fit import Fit
 from slamlib.robust.initialization import odometry_state
 from slamlib.robust.linear import Problem, State, state_from_arrays
-from slamlib.robust.measurements import Noise
 
 ODOMETRY_STEPS = 8               # number of steps from odometry; on a long drive each is dear
 SAME_ERROR = 10 * CONVERGED      # relative difference of errors of one minimum
@@ -66,9 +59,9 @@ CALIBRATION_KEYS = ((W(0), WHEELS), (S(0), SIGHTINGS), (R(0), RANGES))
 class GtsamSolution:
     """GTSAM's solution, as arrays; covariances of poses and markers in their own axes."""
 
-    state: State                 # averaged over the noise
-    mode: State                  # of least error
+    state: State
     frames: np.ndarray           # (f, 3, 3)
+    pairs: np.ndarray            # (f-1, 6, 6) of each frame and the next one
     landmarks: np.ndarray        # (k + a, 3, 3); of a point (2, 2) counts
     c: np.ndarray                # (p, p) of the calibration, 0 where it is known
     factors: int                 # number of factors in the graph
@@ -78,14 +71,14 @@ class GtsamSolution:
     converged: bool
 
 
-def graph_of(problem: Problem, noise: Noise) -> gtsam.NonlinearFactorGraph:
-    """The graph of a Problem for a Noise."""
-    graph = build_graph(decisions_of(problem, noise))
+def graph_of(problem: Problem) -> gtsam.NonlinearFactorGraph:
+    """The graph of a Problem."""
+    graph = build_graph(decisions_of(problem))
     if not sightings_are_native(problem):
         for as_pose in (True, False):
-            add_calibrated_sightings(graph, problem, noise, as_pose)
+            add_calibrated_sightings(graph, problem, as_pose)
     if not ranges_are_native(problem):
-        add_calibrated_ranges(graph, problem, noise)
+        add_calibrated_ranges(graph, problem)
     for key, columns in CALIBRATION_KEYS[1:]:
         count = len(unknown_of(problem, columns))
         if count:
@@ -107,15 +100,15 @@ def ranges_are_native(problem: Problem) -> bool:
     return not problem.active[RANGES].any() and not elsewhere
 
 
-def decisions_of(problem: Problem, noise: Noise) -> Decisions:
-    """The Decisions of a Problem for a Noise, without what custom factors measure."""
+def decisions_of(problem: Problem) -> Decisions:
+    """The Decisions of a Problem, without what custom factors measure."""
     m = problem.measurements
     vehicle = m.dataset.vehicle
-    accepted = accepted_dataset(problem, noise)
+    accepted = accepted_dataset(problem)
     sightings, ranges = problem.accepted
     return Decisions(
         odometry=problem.odometry,
-        slip=noise.slip,
+        slip=problem.noise.slip,
         sigma_heading=vehicle.sigma_heading,
         root_wheel=problem.prior.of(WHEELS),
         sightings=accepted.sightings if sightings_are_native(problem) else NO_SIGHTINGS,
@@ -127,9 +120,10 @@ def decisions_of(problem: Problem, noise: Noise) -> Decisions:
         kernel=vehicle.kernel)
 
 
-def accepted_dataset(problem: Problem, noise: Noise) -> Dataset:
-    """The Dataset of the accepted measurements with the sigmas of a Noise."""
+def accepted_dataset(problem: Problem) -> Dataset:
+    """The Dataset of the accepted measurements with the sigmas of the noise."""
     m = problem.measurements
+    noise = problem.noise
     s = m.sightings
     r = m.ranges
     sightings, ranges = problem.accepted
@@ -143,8 +137,7 @@ def accepted_dataset(problem: Problem, noise: Noise) -> Dataset:
                    uwb=measured.select(ranges.weight > 0))
 
 
-def add_calibrated_sightings(graph: gtsam.NonlinearFactorGraph, problem: Problem, noise: Noise,
-                             as_pose: bool):
+def add_calibrated_sightings(graph: gtsam.NonlinearFactorGraph, problem: Problem, as_pose: bool):
     """Add the accepted sightings of markers with a heading, or of points, by their calibration."""
     m = problem.measurements
     accepted = problem.accepted.sightings
@@ -162,13 +155,13 @@ def add_calibrated_sightings(graph: gtsam.NonlinearFactorGraph, problem: Problem
 
     markers = marker_keys(problem)
     landmarks = [markers[k] for k in m.marker_row[rows]]
-    covariances = noise.sightings**2 * m.sighting_covariances[rows, :size, :size]
+    covariances = problem.noise.sightings**2 * m.sighting_covariances[rows, :size, :size]
     kernel = symmetric(m.dataset.vehicle.kernel)
     add_calibrated(graph, problem, errors, frame, landmarks, (S(0), SIGHTINGS), covariances, kernel,
                    accepted.share[rows])
 
 
-def add_calibrated_ranges(graph: gtsam.NonlinearFactorGraph, problem: Problem, noise: Noise):
+def add_calibrated_ranges(graph: gtsam.NonlinearFactorGraph, problem: Problem):
     """Add the accepted ranges by their calibration."""
     m = problem.measurements
     accepted = problem.accepted.ranges
@@ -177,7 +170,7 @@ def add_calibrated_ranges(graph: gtsam.NonlinearFactorGraph, problem: Problem, n
     antenna = m.ranges.antenna[rows]
     is_known = not problem.active[RANGE_LAG]
     kernel = m.dataset.vehicle.kernel
-    sigma = noise.ranges * m.ranges.sigma[rows, None]
+    sigma = problem.noise.ranges * m.ranges.sigma[rows, None]
     measured = m.ranges.distance[rows]
     bias = ONE_SIDED_BIAS.get(kernel, 0.0) * sigma
 
@@ -294,12 +287,12 @@ def state_at(fit: Fit, values: gtsam.Values) -> State:
 
 
 def solve_by_gtsam(fit: Fit) -> GtsamSolution:
-    """GTSAM's solution of the graph of a Fit, averaged over its noise.
+    """GTSAM's solution of the graph of a Fit.
 
     Raises DatasetError where the measurements do not determine every variable.
     """
     problem = fit.problem
-    graph = graph_of(problem, solved_noise(fit))
+    graph = graph_of(problem)
     decided = values_of(problem, fit.state, graph)
     odometry = odometry_state(problem.measurements, problem.odometry.model)
     found = gauss_newton(graph, values_of(problem, odometry, graph), ODOMETRY_STEPS)
@@ -308,79 +301,45 @@ def solve_by_gtsam(fit: Fit) -> GtsamSolution:
     if not found.converged or found.error > limit + SAME_ERROR * (1 + limit):
         found = gauss_newton(graph, decided)
         start = FROM_ENGINE
-    return averaged(fit, graph, found, start)
-
-
-def solved_noise(fit: Fit) -> Noise:
-    """The Noise of the graph that is solved: that of the only point, or the most probable one."""
-    points = fit.noise_points
-    return points[0][1] if len(points) == 1 else fit.problem.noise
-
-
-def averaged(fit: Fit, graph: gtsam.NonlinearFactorGraph, found: GaussNewton,
-             start: str) -> GtsamSolution:
-    """The GtsamSolution by the moments over the noise's posterior at the solution of a graph."""
-    problem = fit.problem
     values = found.values
-    points = fit.noise_points
-    weights = np.array([weight for weight, _ in points])
-    weights /= weights.sum()
-    marginals = [found.marginals]
-    off = [values.zeroVectors()]
-    moved = values
-    if len(points) > 1:
-        ordering = gtsam.Ordering.ColamdNonlinearFactorGraph(graph)
-        solved = [eliminated(graph_of(problem, noise).linearize(values), ordering)
-                  for _, noise in points]
-        marginals = [Marginals(tree) for tree, _ in solved]
-        mean = values.zeroVectors()
-        for weight, (_, step) in zip(weights, solved):
-            mean = mean.add(step.scale(weight))
-        off = [step.subtract(mean) for _, step in solved]
-        _, at_mode = eliminated(graph.linearize(values), ordering)
-        moved = values.retract(mean.subtract(at_mode))
-
-    def covariance(key, other=None):
-        """Block (d, e) of the averaged covariance of one or two variables."""
-        total = 0.0
-        for weight, marginal, step in zip(weights, marginals, off):
-            spread = step.at(key)[:, None] * step.at(other or key)
-            block = marginal.joint(key, other) if other else marginal.covariance(key)
-            total = total + weight * (block + spread)
-        return total
-
-    blocks = blocks_of(problem, values, covariance)
-    f = len(problem.measurements.frame)
+    marginals = found.marginals
+    blocks = blocks_of(problem, values, marginals)
+    frames = [X(i) for i in problem.measurements.frame.tolist()]
+    pairs = [marginals.pair(first, second) for first, second in pairwise(frames)]
     return GtsamSolution(
-        state=state_at(fit, moved), mode=state_at(fit, values),
-        frames=blocks[:f], landmarks=blocks[f:],
-        c=calibration_covariance(problem, values, covariance),
+        state=state_at(fit, values), frames=blocks[:len(frames)],
+        pairs=np.reshape(pairs, (-1, 6, 6)), landmarks=blocks[len(frames):],
+        c=calibration_covariance(problem, values, marginals),
         factors=graph.size(), variables=values.size(), steps=found.steps, start=start,
         converged=found.converged)
 
 
-def blocks_of(problem: Problem, values: gtsam.Values, covariance: Callable) -> np.ndarray:
+def blocks_of(problem: Problem, values: gtsam.Values, marginals: Marginals) -> np.ndarray:
     """Covariances (f + k + a, 3, 3) of all variables, zero of those that are not in the graph.
 
-    Such are markers without accepted sightings. `covariance` gives that of a key.
+    Such are markers without accepted sightings.
     """
     keys = variable_keys(problem)
     blocks = np.zeros((len(keys), 3, 3))
     for k, key in enumerate(keys):
         if values.exists(key):
-            C = covariance(key)
+            C = marginals.covariance(key)
             blocks[k, :len(C), :len(C)] = C
     return blocks
 
 
-def calibration_covariance(problem: Problem, values: gtsam.Values, covariance) -> np.ndarray:
+def calibration_covariance(problem: Problem, values: gtsam.Values,
+                           marginals: Marginals) -> np.ndarray:
     """Covariance (p, p) of the calibration, 0 where it is known."""
     of_unknowns = np.zeros_like(problem.prior.root)
     there = [(key, unknown_of(problem, columns))
              for key, columns in CALIBRATION_KEYS if values.exists(key)]
     for key, rows in there:
         for other, columns in there:
-            block = covariance(key) if key == other else covariance(key, other)
+            if key == other:
+                block = marginals.covariance(key)
+            else:
+                block = marginals.joint(key, other)
             of_unknowns[np.ix_(rows, columns)] = block
     root = problem.prior.root
     return root @ of_unknowns @ root.T

@@ -27,8 +27,8 @@ MAX_REJECTED_OF_MARKER = 0.2     # share of its sightings, the same
 MAX_MARKERS_NAMED = 8        # of those, in one sentence
 MAX_STRETCHES_NAMED = 3      # of the drive, where counts and markers contradict each other
 MIN_TOLD_SIGMAS = 2.0        # of its own sigmas, by which an estimate that is named is off
-# Sigmas of a pose, and relative of a sigma, by engine and GTSAM. Sightings of points are
-# coordinates in one, bearing and distance in the other: up to 0.11 on clean drives.
+# Sigmas of a pose, by engine and GTSAM. Sightings of points are coordinates in one, bearing and
+# distance in the other: up to 0.11 on clean drives.
 MAX_DISAGREEMENT = 0.25
 # By group of the calibration: its name in a sentence, and what to look at.
 GROUPS = {
@@ -326,9 +326,7 @@ def _path_doubts(result):
 
 def _agreement_doubts(result):
     """A Doubt if GTSAM's solution is not that by which the engine decided."""
-    off, ratio = result.agreement
-    if max(off, ratio) > MAX_DISAGREEMENT:
+    if result.disagreement > MAX_DISAGREEMENT:
         yield Doubt("agreement", (
-            f"GTSAM's solution differs by up to {off:.2g} standard deviations from that by which "
-            f"noise and outliers were decided, and its standard deviations by up to {ratio:.0%}: "
-            "what was decided may not fit it."))
+            f"GTSAM's solution differs by up to {result.disagreement:.2g} standard deviations from "
+            "that by which noise and outliers were decided: what was decided may not fit it."))
