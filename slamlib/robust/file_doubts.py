@@ -21,7 +21,6 @@ from slamlib.robust.part_faults import (
     MIN_AGREEING_SHARE,
     MIN_COUNT,
     contradictions,
-    later_delay,
     moving_increments,
     other_axes,
     with_headings_reversed,
@@ -66,7 +65,7 @@ class Doubt:
 def doubts_before_solving(dataset: Dataset) -> list[Doubt]:
     """List of Doubts about the files of a Dataset, where enough is known."""
     doubts = []
-    for check in (motion_doubts, delay_doubts, range_units, sigma_units, cut_counts):
+    for check in (motion_doubts, range_units, sigma_units, cut_counts):
         with suppress(np.linalg.LinAlgError):              # where increments have no covariance
             doubts += list(check(dataset))
         if any(doubt.what == "encoder-dead" for doubt in doubts):
@@ -160,17 +159,6 @@ def _axes_doubt(stretch, is_mended):
     return Doubt(what, sentence, (
         "Look at the order of right and left and at the signs in encoderReading.txt, and at the "
         "axes of the camera."))
-
-
-def delay_doubts(dataset: Dataset) -> Iterator[Doubt]:
-    """Doubt, if the delay of the sightings changes during the drive."""
-    delay = later_delay(with_wheels_mended(dataset))
-    if delay is not None:
-        yield Doubt("delay-changes", (
-            f"From pose {delay.pose + 1} on, sightings are {abs(delay.steps)} encoder steps "
-            f"{'later' if delay.steps > 0 else 'earlier'} than before. Problem 2's fusion and "
-            "problems 3 and 4 use them with the pose ids of their time."),
-            "Look at the clocks of camera and encoders, and for lost rows.")
 
 
 def wrong_sizes(markers: np.ndarray, wheels: np.ndarray,
