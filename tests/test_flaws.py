@@ -6,12 +6,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from numeric import aruco, assert_consistent, short, uwb, vehicle
-from numpy.testing import assert_allclose
 
 from slamlib import estimate, solve
-from slamlib.core.records import Dataset
 from slamlib.core.se2 import sigmas
-from slamlib.core.vehicle import Vehicle
 from slamlib.robust.calibration import CAMERA, SIGHTING_LAG
 from slamlib.robust.file_doubts import doubts_before_solving
 from slamlib.robust.measurements import Noise
@@ -21,7 +18,6 @@ from slamlib.robust.solution_doubts import (
     contradiction_doubts,
     solution_doubts,
 )
-from slamlib.studies.simulation import manoeuvre
 
 
 def sightings_of(variances, covariance=0.0):
@@ -224,25 +220,6 @@ def test_a_fusion_that_contradicts_problem_3_is_told_with_distance_and_share():
     poses[5:, :2] = [0.03, 0.04]
     doubt, = contradiction_doubts(poses, np.tile(1e-4 * np.eye(3), (10, 1, 1)), 0 * poses)
     assert "up to 0.05 m from problem 3, and at 50% of the poses" in doubt.sentence
-
-
-def test_a_turn_that_the_wheels_hardly_know_is_named_where_it_is(found):
-    """The third increment between frames."""
-    sigma = np.zeros(len(found.sightings.frame) - 1)
-    sigma[2] = 1.3
-    first, second = found.sightings.frame[[2, 3]] + 1
-    doubt, = solution_doubts(replace(found, turn_sigma=sigma))
-    assert f"Between poses {first} and {second} only" in doubt.sentence
-    assert "to 1.3 rad" in doubt.sentence
-    assert not solution_doubts(replace(found, turn_sigma=sigma / 2))
-
-
-@pytest.mark.parametrize("slip, sigma", [(1e-5, 0.5), (0.05, np.hypot(0.5, 0.25))])
-def test_a_turn_between_frames_is_known_as_well_as_wheelbase_and_slip(slip, sigma):
-    """Ten radians on an arc of 1 m, with a wheelbase known to 5 %: wheels run 3 m and 1 m."""
-    ticks = np.rint(manoeuvre([(1.0, 10.0)]))
-    drive = Dataset("turn", Vehicle(sigma_wheelbase=0.02), ticks, None, None, None)
-    assert_allclose(estimate(drive, slip=slip).turn_sigma, [sigma], rtol=0.02)
 
 
 def test_markers_of_one_accepted_sighting_or_at_the_place_of_another_are_unconfirmed(found):

@@ -11,7 +11,6 @@ from numeric import (
     mean_nees,
     seen_from,
     short,
-    vehicle,
     without_headings,
 )
 from numpy.testing import assert_allclose, assert_array_equal
@@ -19,9 +18,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from slamlib import estimate, fuse
 from slamlib.core import se2
 from slamlib.core.vehicle import Vehicle
-from slamlib.robust.file_doubts import doubts_before_solving
 from slamlib.robust.jumps import frozen_rows
-from slamlib.robust.part_faults import camera_bump, later_delay, slipping_rows
+from slamlib.robust.part_faults import camera_bump, slipping_rows
 from slamlib.robust.solution_doubts import fusion_doubts, solution_doubts
 
 BUMP = np.array([0.05, -0.03, 0.06])
@@ -73,61 +71,6 @@ def test_a_moved_camera_is_told_and_costs_problems_2_and_3_nothing():
     assert off @ np.linalg.solve(found.c_covariance[np.ix_(bump, bump)], off) < 16.3
     for solution, alone in ((found, estimate(clean)), (fuse(spoilt), fuse(clean))):
         assert aligned_ate(solution, truth) < 1.5 * aligned_ate(alone, truth) + 2e-3
-
-
-def later_by(dataset, pose, steps):
-    """The Dataset whose sightings from a pose on are later by some encoder steps."""
-    readings = dataset.aruco
-    late = readings.pose + np.where(readings.pose >= pose, steps, 0)
-    return aruco(dataset, pose=np.minimum(late, len(dataset.ticks) - 1))
-
-
-@pytest.mark.parametrize("pose, steps", [(1000, 8), (600, -5)])
-def test_a_delay_that_changes_is_told_and_costs_problems_2_and_3_nothing(pose, steps):
-    clean, truth = short(24)
-    clean = clean.without("uwb")
-    spoilt = later_by(clean, pose, steps)
-    delay = later_delay(spoilt)
-    assert abs(delay.steps - steps) <= 1 and abs(delay.pose - pose) < 50
-    doubt, = doubts_before_solving(spoilt)
-    assert doubt.what == "delay-changes"
-    assert ("later" if steps > 0 else "earlier") in doubt.sentence
-    found = estimate(spoilt)
-    assert not solution_doubts(found)
-    for solution, alone in ((found, estimate(clean)), (fuse(spoilt), fuse(clean))):
-        assert aligned_ate(solution, truth) < 1.5 * aligned_ate(alone, truth) + 5e-3
-
-
-@pytest.mark.parametrize("stated", [0.0, 5.0])
-def test_a_delay_that_changes_is_found_beside_one_before_and_a_camera_elsewhere(stated):
-    dataset = with_moved_camera(short(24)[0], 0)
-    readings = dataset.aruco
-    late = readings.pose + np.where(readings.pose >= 1000, 1, 6)
-    late = np.minimum(late, len(dataset.ticks) - 1)
-    spoilt = aruco(vehicle(sighting_lag=stated)(dataset), pose=late)
-    delay = later_delay(spoilt)
-    assert delay.steps == -5 and abs(delay.pose - 1000) < 50
-
-
-def test_slips_on_few_increments_are_no_change_of_the_delay():
-    assert later_delay(short(9112, 600, slip=0.03)[0]) is None
-
-
-@pytest.mark.parametrize("seed", [41, 42, 43])
-def test_a_delay_that_stays_is_no_change(seed):
-    clean = short(seed, slip=3e-3, mislabelled=0.05)[0]
-    late = np.minimum(clean.aruco.pose + 4, len(clean.ticks) - 1)
-    assert later_delay(clean) is None
-    assert later_delay(aruco(clean, pose=late)) is None
-    assert later_delay(with_moved_camera(clean, 900)) is None
-    lost = counts(slice(600, 900), lambda ticks: 0 * ticks)(clean)
-    assert later_delay(lost) is None
-    assert later_delay(short(105 + seed, memory=0.95)[0]) is None
-
-
-def test_most_changes_of_the_delay_by_two_centimetres_are_found():
-    delays = [later_delay(later_by(short(seed)[0], 1000, 2)) for seed in range(11, 17)]
-    assert sum(delay is not None and delay.steps == 2 for delay in delays) >= 4
 
 
 def test_counts_of_a_patch_on_which_wheels_slip_are_not_used():

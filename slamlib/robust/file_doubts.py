@@ -3,8 +3,7 @@
 Markers and wheels both measure increments [x, y, heading] of the vehicle. Wrong axes or signs of
 one of them change these to [A (x, y), det(A) heading], A one of the eight symmetries of a square.
 Exchanged wheels and a camera mirrored in y and theta have the same A; one wheel that is reversed
-has none. Wrong units show in ratios of
-lengths, and of stated standard deviations to the scatter of measurements.
+has none. Wrong units show in ratios of lengths.
 """
 
 from collections.abc import Iterable, Iterator
@@ -13,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slamlib.core import odometry, se2
+from slamlib.core import odometry
 from slamlib.core.marker_increments import distance_and_turn
 from slamlib.core.records import Dataset
 from slamlib.robust.part_faults import (
@@ -21,7 +20,6 @@ from slamlib.robust.part_faults import (
     MIN_AGREEING_SHARE,
     MIN_COUNT,
     contradictions,
-    later_delay,
     moving_increments,
     other_axes,
     with_headings_reversed,
@@ -33,12 +31,10 @@ from slamlib.robust.part_faults import (
 MIN_RANGES_PER_ANTENNA = 4
 MIN_UNIT_SHARE = 0.9      # of the increments that one factor explains
 MAX_FACTOR = 5.0          # ratio of lengths from which on the unit is in doubt
-MAX_SIGMA_RATIO = 15.0    # of a stated standard deviation to the scatter; in degrees it is 57
 MAX_ODOMETRY_HEADING_SIGMA = 0.1   # rad, at the end of the path that is compared with ranges
 # Ratio of the distance of the ranges' quartiles to the path's sigma; 1 is usual
 MIN_SPREAD = 0.027
 MAX_SPREAD = 4.7
-SECOND_DIFFERENCE = 0.6745 * 6**0.5      # median size, of independent errors of sigma 1
 MIN_DIFFERENT_COUNTS = 8  # from which on a common divisor says that counts were cut off
 # Kinds of doubts from which most others follow
 DECISIVE = ("encoder-dead", "wheels-swapped", "wheels-reversed", "camera-mirrored", "camera-turned",
@@ -66,7 +62,7 @@ class Doubt:
 def doubts_before_solving(dataset: Dataset) -> list[Doubt]:
     """List of Doubts about the files of a Dataset, where enough is known."""
     doubts = []
-    for check in (motion_doubts, delay_doubts, range_units, sigma_units, cut_counts):
+    for check in (motion_doubts, range_units, cut_counts):
         with suppress(np.linalg.LinAlgError):              # where increments have no covariance
             doubts += list(check(dataset))
         if any(doubt.what == "encoder-dead" for doubt in doubts):
@@ -160,17 +156,6 @@ def _axes_doubt(stretch, is_mended):
     return Doubt(what, sentence, (
         "Look at the order of right and left and at the signs in encoderReading.txt, and at the "
         "axes of the camera."))
-
-
-def delay_doubts(dataset: Dataset) -> Iterator[Doubt]:
-    """Doubt, if the delay of the sightings changes during the drive."""
-    delay = later_delay(with_wheels_mended(dataset))
-    if delay is not None:
-        yield Doubt("delay-changes", (
-            f"From pose {delay.pose + 1} on, sightings are {abs(delay.steps)} encoder steps "
-            f"{'later' if delay.steps > 0 else 'earlier'} than before. Problem 2's fusion and "
-            "problems 3 and 4 use them with the pose ids of their time."),
-            "Look at the clocks of camera and encoders, and for lost rows.")
 
 
 def wrong_sizes(markers: np.ndarray, wheels: np.ndarray,
@@ -272,41 +257,3 @@ def common_divisor(ticks: np.ndarray) -> int:
     if divisor > 1 and len(np.unique(np.abs(whole))) < MIN_DIFFERENT_COUNTS:
         return 1
     return divisor
-
-
-def sigma_units(dataset: Dataset) -> Iterator[Doubt]:
-    """Doubts about stated sigmas far above the scatter of a landmark's measurements."""
-    seen = dataset.aruco
-    heard = dataset.uwb
-    if seen is not None:
-        columns = {"s_xx (m^2)": 0, "s_yy (m^2)": 1, "s_thetatheta (rad^2)": 2}
-        sigma = se2.sigmas(seen.covariance)
-        for name, k in columns.items():
-            yield from _sigma_unit(seen.pose, seen.marker, seen.marker_in_vehicle[:, k],
-                                   sigma[:, k], f"{name} in ArucoReading.txt")
-    if heard is not None:
-        yield from _sigma_unit(heard.pose, heard.antenna, heard.range, heard.sigma,
-                               "sigma (m) in UwbReading.txt")
-
-
-def _sigma_unit(pose, landmark, values, sigma, column):
-    """Doubt about the sigmas (m,) in a column of a file, by measured `values` (m,) of landmarks.
-
-    Second differences of successive measurements show the scatter; motion only increases it. A
-    heading that is stated to be worse than pi is unknown.
-    """
-    order = np.lexsort([pose, landmark])
-    landmark = landmark[order]
-    second = np.diff(values[order], 2)[landmark[2:] == landmark[:-2]]
-    stated = np.median(sigma)
-    if "theta" in column:
-        second = se2.wrap(second)
-        if stated >= np.pi:
-            return
-    if len(second) < MIN_COUNT:
-        return
-    scatter = np.median(np.abs(second)) / SECOND_DIFFERENCE
-    if 0 < MAX_SIGMA_RATIO * scatter < stated:
-        yield Doubt("units", (
-            f"Successive measurements scatter by {scatter:.3g} at most, but the standard deviation "
-            f"that {column} states is {stated:.3g} (medians)."), f"Look at the unit of {column}.")

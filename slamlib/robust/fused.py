@@ -44,7 +44,7 @@ from slamlib.core.records import Dataset
 from slamlib.core.sightings import GATE, sightings_by_frame
 from slamlib.robust.calibration import stated_calibration
 from slamlib.robust.jumps import NO_JUMPS, Jumps, crawls, creep_covariance, find_jumps
-from slamlib.robust.part_faults import camera_bump, constant_delay, mended
+from slamlib.robust.part_faults import camera_bump, constant_delay, with_wheels_mended
 
 SLIPS = TYPICAL_SLIP * SLIP_FACTOR ** np.arange(-1.0, 4.0)     # sqrt(m), of the first filters
 FINE_STEPS = 1.4 ** np.arange(-2.0, 3.0)     # slips of the last filters, over the likeliest one
@@ -144,7 +144,7 @@ def fuse(dataset: Dataset, slip: float | None = None) -> LearnedFusion:
     (2000, 3)
     """
     require(isinstance(dataset, Dataset), "fuse", "a Dataset", dataset)
-    dataset = _with_delay_mended(mended(dataset))
+    dataset = _with_delay_mended(with_wheels_mended(dataset))
     if slip is None:
         slip = dataset.vehicle.slip
     dataset = _with_camera_mended(dataset, slip or TYPICAL_SLIP)

@@ -13,8 +13,7 @@ that is off by c = [x, y, turn] changes the position of an increment [p, h] by
 
 For each moment, weighted least squares tell c before and after it, and how much smaller the squared
 residuals are than with one c (generalised likelihood ratio: Basseville and Nikiforov,
-Detection of Abrupt Changes, 1993, section 2.4). Where a change of the delay in addition makes them
-decidedly smaller, the clocks moved instead: later sightings get the pose ids of their time.
+Detection of Abrupt Changes, 1993, section 2.4).
 
 Where wheels slip on a patch of the ground, both seem to have other radii there. The stretch is the
 one with the greatest likelihood ratio, and its counts are not used.
@@ -22,7 +21,7 @@ one with the greatest likelihood ratio, and its counts are not used.
 
 import logging
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -55,11 +54,8 @@ MAX_STRETCH = 0.5         # of the drive, in which wheels are exchanged; else th
 MIN_BUMP_GAIN = 35.0      # of squared residuals, by a camera that was moved
 MAX_BUMP = 0.3            # m and rad, of a motion of the camera
 BUMP_SIGMA = 0.2          # m and rad, of a camera about its stated place, before and after
-DELAY_UNIT = 50.0         # encoder steps; BUMP_SIGMA of them is the sigma of a delay, too
 DELAYS = range(-12, 13)   # encoder steps, of a delay of the whole drive
-MIN_DELAY_GAIN = 6.0      # of squared residuals, each up to a limit, by a change of the delay, in
-                          # the variance that they show, if that is above the stated one
-MAX_DELAY_COST = 0.83     # of the squared residuals, each up to a limit, without this change
+MAX_DELAY_COST = 0.83     # of the squared residuals, each up to a limit, without this delay
 REWEIGHTED = 4            # times, by the residuals
 MIN_WHEELS_GAIN = 25.0    # of squared residuals, by other wheels in a stretch
 STRETCH_LENGTHS = 30      # number of lengths that are tried
@@ -324,62 +320,6 @@ def camera_bump(dataset: Dataset) -> CameraBump | None:
     return bump
 
 
-class LaterDelay(NamedTuple):
-    """A change of the delay of the sightings during a drive."""
-
-    pose: int                # pose id, from 0, from which on it is larger
-    steps: int               # by so many encoder steps, below 0 if it is smaller
-
-    def mended(self, dataset: Dataset) -> Dataset:
-        """The Dataset with the pose ids that its later sightings had before the change."""
-        aruco = dataset.aruco
-        pose = aruco.pose - np.where(aruco.pose >= self.pose, self.steps, 0)
-        pose = np.clip(pose, 0, len(dataset.ticks) - 1)
-        in_order = replace(aruco, pose=pose).select(np.argsort(pose, kind="stable"))
-        return replace(dataset, aruco=in_order)
-
-
-@lru_cache(maxsize=2)
-def later_delay(dataset: Dataset) -> LaterDelay | None:
-    """The LaterDelay of a Dataset, or None if the camera's place explains the sightings as well."""
-    markers, wheels, sigma, poses = moving_increments(dataset)
-    if not _agree_mostly(markers, wheels, sigma):
-        return None
-    path = odometry.dead_reckoning(dataset.ticks, dataset.vehicle, model="arc")
-    increments_late_by = partial(_late_increments, path, poses)
-
-    def by_camera_and_delay(late):
-        """Derivatives (n, 2, 4) of positions where markers are seen `late`, in steps."""
-        by_step = se2.difference(increments_late_by(late + 1), increments_late_by(late - 1)) / 2
-        by_delay = DELAY_UNIT * by_step[:, :2, None]
-        return np.concatenate([_by_camera(increments_late_by(late)), by_delay], axis=2)
-
-    k, before, after, _ = _change(markers, wheels, sigma, by_camera_and_delay(0))
-    first = round(DELAY_UNIT * before[3])
-    steps = round(DELAY_UNIT * after[3]) - first
-    if steps == 0:
-        return None
-
-    def cost(delay):
-        """Squared residuals, each up to a limit, if it is mended and nothing else changes."""
-        late = first + np.where(poses >= delay.pose, delay.steps, 0)
-        return _cost(markers, increments_late_by(late), sigma, by_camera_and_delay(late))
-
-    near = np.unique(poses[max(k - 2 * OVERLAP, 0):k + 2 * OVERLAP])
-    at_each = [LaterDelay(int(pose), steps) for pose in near]
-    found = min(at_each, key=cost)
-    by_one = [found._replace(steps=each) for each in {steps - 1, steps + 1} - {0}]
-    found = min([found, *by_one], key=cost)
-    least = cost(found)
-    without = cost(found._replace(steps=0))
-    variance = max(1.0, least / (2 * len(poses)))
-    if least > min(MAX_DELAY_COST * without, without - MIN_DELAY_GAIN * variance * OVERLAP):
-        return None
-    found = found._replace(pose=found.pose + round(dataset.vehicle.sighting_lag))
-    log.info("sightings: from pose %d on %d steps later", found.pose + 1, found.steps)
-    return found
-
-
 @lru_cache(maxsize=2)
 def constant_delay(dataset: Dataset) -> int:
     """Encoder steps by which all sightings are later than stated, 0 if it is not decidedly so."""
@@ -423,13 +363,6 @@ def _cost(markers, wheels, sigma, by_change):
     J = np.concatenate([by_change, wheels[:, :2, None]], axis=2)
     _, squared = _in_common(e, J, sigma[:, :1]**2 / 2)
     return np.minimum(squared, GATE).sum()
-
-
-def mended(dataset: Dataset) -> Dataset:
-    """The Dataset with its wheels mended, and then the pose ids of later sightings."""
-    dataset = with_wheels_mended(dataset)
-    delay = later_delay(dataset)
-    return dataset if delay is None else delay.mended(dataset)
 
 
 def _by_camera(wheels):

@@ -22,14 +22,13 @@ from slamlib.robust.choices import (
     calibrated,
     memory_or_slip,
     most_consistent,
-    with_held_slip,
 )
 from slamlib.robust.fit import CAUCHY_SCALES, Fit, narrow_kernels, refine, settled
 from slamlib.robust.initialization import initial_state, state_from_poses
 from slamlib.robust.jumps import NO_JUMPS
 from slamlib.robust.linear import Problem, build_problem
 from slamlib.robust.measurements import Measurements, Noise, measure
-from slamlib.robust.part_faults import mended
+from slamlib.robust.part_faults import with_wheels_mended
 from slamlib.robust.result import SlamResult, slam_result
 
 log = logging.getLogger(__name__)
@@ -78,7 +77,7 @@ def estimate(dataset: Dataset, slip: float | None = None, model: str | None = No
     started = time.perf_counter()
     require(isinstance(dataset, Dataset), "estimate", "a Dataset", dataset)
     require_rows(dataset, poses, "estimate")
-    dataset = mended(dataset)
+    dataset = with_wheels_mended(dataset)
     require_same_drive(dataset, previous)
     require(model in (None, *MODELS), "estimate", f"{' or '.join(MODELS)} for model", model)
     options = {"slip": slip, "marker_noise_factor": marker_noise_factor,
@@ -151,8 +150,6 @@ def fit_from_odometry(measurements: Measurements, model: str = "arc",
 
 def decided_like(problem: Problem, decided: Problem, prior: Prior) -> Problem:
     """The Problem with a prior of the calibration, and what else another one has decided."""
-    if decided.is_shaken:
-        problem = with_held_slip(problem)
     return replace(problem, prior=prior, memory_first=decided.memory_first)
 
 
@@ -162,7 +159,7 @@ def fit_from_previous(measurements: Measurements, previous: SlamResult,
     m = measurements
     problem = build_problem(m, model or previous.model, Noise(previous.slip), previous.wheel)
     decided = previous.fit.problem
-    prior = m.calibration.prior(decided.prior.groups, decided.prior.width)
+    prior = m.calibration.prior(decided.prior.groups)
     problem = decided_like(problem, decided, prior)
     c = m.calibration.taken_from(previous.calibration, previous.c)
     state = state_from_poses(m, previous.poses[m.frame], previous.covariances[m.frame], c)

@@ -60,7 +60,6 @@ class SlamResult:
     range_weight: np.ndarray        # (r,) share of its information that each range keeps, 0 to 1
     range_residual: np.ndarray      # (r,) whitened, positive for a range that is too long
     correlation: tuple              # of neighbours' residuals of a marker, and of an antenna
-    turn_sigma: np.ndarray          # (f-1,) rad, of odometry's turns between frames, stated wheels
     fit: Fit                        # what was decided, and by which solution
     gtsam: GtsamSolution            # what is handed in
     disagreement: float             # largest difference of both, sigmas
@@ -158,8 +157,7 @@ def slam_result(fit: Fit) -> SlamResult:
         doubts=doubts, c=state.c, c_covariance=solution.c, noise_sigma=noise_sigma,
         rejected=rejected, range_weight=range_weight, range_residual=range_residual,
         correlation=tuple(memory.correlation for memory in memories),
-        turn_sigma=turn_sigma(problem), fit=fit, gtsam=solution,
-        disagreement=_difference_from(fit, solution))
+        fit=fit, gtsam=solution, disagreement=_difference_from(fit, solution))
 
 
 def _mostly_accepted(measurements, rejected):
@@ -192,17 +190,6 @@ def _difference_from(fit, solution):
     difference[:, 2] = se2.wrap(difference[:, 2])
     off = np.abs(difference[known]) / np.sqrt(variances[known])
     return float(off.max(initial=0.0))
-
-
-def turn_sigma(problem: Problem) -> np.ndarray:
-    """Standard deviations (f-1,), rad, of the turns between frames by odometry of stated wheels."""
-    m = problem.measurements
-    odometry = problem.odometry
-    by_wheels = odometry.J_wheel[:, 2] * m.dataset.vehicle.sigma_wheel
-    of_wheels = np.sum(by_wheels**2, axis=1)
-    of_slip = odometry.covariance(problem.noise.slip)[:, 2, 2]
-    by_markers = m.jumps.share(m.frame[:-1], m.frame[1:]).any(axis=1)
-    return np.where(by_markers, 0.0, np.sqrt(of_wheels + of_slip))
 
 
 def antenna_doubts(problem: Problem, state: State, frame_covariances: np.ndarray,

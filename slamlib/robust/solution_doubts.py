@@ -14,7 +14,6 @@ from slamlib.robust.jumps import UNKNOWN_SIGMA
 from slamlib.robust.noise import BOUNDS
 from slamlib.robust.result import SlamResult
 
-MAX_TURN_SIGMA = np.pi / 3   # rad, between two frames; half a turn is three sigmas
 MAX_GAP = 30                 # poses, between contradictions that are told as one
 MAX_SLIP = 0.02              # sqrt(m), of wheels on the ground
 MIN_CONTRADICTING = 0.05     # share of the poses where problem 2's fusion contradicts problem 3
@@ -300,24 +299,9 @@ def _slip_doubt(slip):
 
 
 def _path_doubts(result):
-    """Doubts on slip, turns between frames, and a solution that still changed."""
-    if result.fit.problem.is_shaken:
-        yield Doubt("camera-shakes", (
-            "Errors of all markers of an image are alike. They move the path to and fro as a large "
-            "slip would, but do not accumulate as slip does: problems 3 and 4 take the slip to be "
-            f"{1e3 * result.slip:.0f} mm (one standard deviation) after one metre."), (
-            "Look whether the camera tilts or shakes while the vehicle moves, and state the slip "
-            "in vehicle.toml."))
+    """Doubts on slip, and on a solution that still changed."""
     if result.noise_sigma[0]:
         yield from _slip_doubt(result.slip)
-    sigma = result.turn_sigma
-    if sigma.max(initial=0) >= MAX_TURN_SIGMA:
-        k = sigma.argmax()
-        first, second = result.sightings.frame[[k, k + 1]] + 1
-        yield Doubt("turns", (
-            f"Between poses {first} and {second} only the wheels were measured, and they know the "
-            f"turn between them to {sigma[k]:.1f} rad (one standard deviation): whole turns may be "
-            "missing in the solution, and with them the path between these poses is wrong."))
     if not result.converged:
         yield Doubt("not-converged", (
             "The solution still changed when its number of steps ended: some poses or landmarks "
