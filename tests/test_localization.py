@@ -224,8 +224,8 @@ def test_sightings_that_are_not_used_are_counted():
     spoilt.marker_in_vehicle[[*moved, other + 1], 0] += 1.0            # `again` comes before
     spoilt = replace(dataset, aruco=spoilt)
     assert fuse(dataset, slip=1e-3).rejected == 0
-    assert fuse(spoilt, slip=1e-3).rejected == 5 + 1 + 2
-    assert fuse_increments(spoilt).rejected == fuse_increments(dataset).rejected + 5 + 1 + 2
+    assert fuse(spoilt, slip=1e-3).rejected == 8
+    assert fuse_increments(spoilt).rejected == fuse_increments(dataset).rejected + 8
 
 
 @pytest.mark.parametrize("slip, sigma, most", [
@@ -242,23 +242,23 @@ def test_slip_and_wheels_are_not_learned_from_counts_that_creep_at_a_stand(slip,
 
 
 def test_beside_slow_errors_the_fusion_believes_no_slip_below_the_typical_one():
-    learned = [fuse(short(3, 1000, memory=memory, slip=1e-4)[0]).slip for memory in (0.0, 0.9)]
-    assert learned[0] < TYPICAL_SLIP == learned[1]
+    white, slow = [fuse(short(3, 1000, memory=rho, slip=1e-4)[0]).slip for rho in (0.0, 0.9)]
+    assert white < TYPICAL_SLIP == slow
 
 
-@pytest.mark.parametrize("memory, most", [(0.0, 0.0165), (0.9, 0.0175)])
-def test_slow_errors_of_the_sightings_are_counted_once(memory, most):
-    """Errors of successive sightings of a marker are alike, by 0.9 or not at all."""
-    off = []
-    ratio = []
+@pytest.mark.parametrize("memory, missed, most", [
+    (0.0, 0, 0.0154), (0.9, 0, 0.0162), (0.9, 0.4, 0.0116)])
+def test_slow_errors_of_the_sightings_are_counted_once(memory, missed, most):
+    """Errors of successive sightings of a marker are alike, also if some between are missed."""
+    found = []
     for seed in range(4):
         dataset, truth = short(seed, 1000, memory=memory)
-        fused = fuse(dataset)
+        draws = np.random.default_rng(seed).random(len(dataset.aruco.pose))
+        fused = fuse(only(dataset, draws > missed))
         assert fused.memory == memory
-        off.append(ate(fused.poses, truth.poses))
-        ratio.append(mean_nees(fused, truth))
-    assert np.sqrt(np.mean(np.square(off))) < most
-    assert 1.5 < np.mean(ratio) < 5
+        found.append((ate(fused.poses, truth.poses), mean_nees(fused, truth)))
+    off, ratio = np.mean(found, axis=0)
+    assert off < most and 1.5 < ratio < 5
 
 
 def test_a_camera_that_is_turned_is_found():

@@ -1,7 +1,7 @@
 """Problem 2, odometry and markers fused by Kalman filters whose state contains the shared errors.
 
 The state contains the pose X, the shared parameters (how far the wheels w = [R_R, R_L, b] are off
-the stated ones, and the camera c) and the markers M_j of the last frame, in the camera, with
+the stated ones, and the camera c) and the markers M_j of the last frames, in the camera, with
 covariance P (Smith, Self and Cheeseman, Estimating Uncertain Spatial Relationships in Robotics,
 1990). Odometry predicts
 
@@ -14,14 +14,17 @@ with covariance C, measure these markers, M' = H state, and update
 
     state <- state + K (Z - M'),    P <- P' - K H P',    K = P' H^T S^-1,    S = H P' H^T + C.
 
-Sightings beyond GATE are rejected. Then the filter removes rejected markers and those out of view,
-and adds new ones with covariance C. Without markers the result is the first-order propagation of
+Sightings beyond GATE are rejected. Then the filter removes rejected markers and those without a
+sighting in MAX_PAUSE frames, and adds new ones with covariance C. A marker that is missed in a few
+frames stays: as a new one it would lose what is known of it. Returns to a place are not used,
+unless within these frames. Without markers the result is the first-order propagation of
 odometry; with uninformative odometry and one marker it is `localize`.
 
 Errors of a marker in successive frames are alike, with the correlation `memory`. The last sighting
 tells the last error, so what is expected and measured is Z = M' + memory (Z_last - M), with the
 covariance (1 - memory^2) C of the new part of the error (Bryson and Henrikson, Estimation using
-sampled data containing sequentially correlated noise, 1968).
+sampled data containing sequentially correlated noise, 1968). For a marker that is missed the state
+has, in place of Z_last, the Z that is expected.
 
 Nobody states the slip. So several filters run side by side, each with its slip, and the likeliest
 by its innovations is taken (multiple models: Bar-Shalom, Li and Kirubarajan 2001, section 11.6).
@@ -43,6 +46,7 @@ from slamlib.core.increments import SLIP_BOUNDS, SLIP_FACTOR, TYPICAL_SLIP
 from slamlib.core.records import Dataset
 from slamlib.core.sightings import GATE, sightings_by_frame
 from slamlib.robust.calibration import stated_calibration
+from slamlib.robust.error_memory import MAX_PAUSE
 from slamlib.robust.jumps import NO_JUMPS, Jumps, crawls, creep_covariance, find_jumps
 from slamlib.robust.part_faults import camera_bump, constant_delay, with_wheels_mended
 
@@ -59,7 +63,7 @@ MIN_JUMP_GAIN = 10.0         # log likelihood by each of many jumps; the loss by
 POSE = slice(0, 3)
 WHEELS = slice(3, 6)
 CAMERA = slice(6, 9)
-MARKERS = slice(9, None)
+SHARED = slice(3, 9)         # both
 
 
 @dataclass(frozen=True)
@@ -111,15 +115,16 @@ class _Models(NamedTuple):
 
 
 class _State(NamedTuple):        # four are made at a frame: faster than frozen dataclasses
-    """h filters at a frame, and the m markers that they keep.
+    """h filters at a frame, and the m markers that they keep, of which the first u are not in view.
 
-    A predicted state has, below the markers, the expected sightings of all of them.
+    A predicted state has X, w, c, the markers and the expected sightings of all of them.
     """
 
-    x: np.ndarray                # (h, 3 + m, 3) X, w, c and M
-    P: np.ndarray                # (h, 9 + 3m, 9 + 3m) covariance of x
+    x: np.ndarray                # (h, 3 + u + m, 3) X, w, c, expected sightings (u), and M
+    P: np.ndarray                # (h, 9 + 3u + 3m, 9 + 3u + 3m) covariance of x
     marker: np.ndarray           # (m,) ids of the markers
-    z: np.ndarray                # (m, 3) their last sightings
+    row: np.ndarray              # (m,) numbers of the frames of their last sightings
+    z: np.ndarray                # (m - u, 3) sightings of the markers in view
     log_density: np.ndarray      # (h,) of the innovations so far and the prior, up to a constant
     rejected: int = 0            # number of sightings so far beyond the gate
 
@@ -213,9 +218,12 @@ def _log_density(dataset, jumps, slip):
 def _log_densities(dataset, jumps, models):
     """Log densities (h,) of all innovations of filters with these _Models, up to a constant.
 
-    Where many markers are seen at once, fewer filters run side by side, or memory would not do.
+    Where many markers are kept at once, fewer filters run side by side, or memory would not do.
     """
-    most = np.bincount(_sightings(dataset).row, minlength=1).max()
+    sightings = _sightings(dataset)
+    in_spans = np.stack([sightings.row // MAX_PAUSE, sightings.marker], axis=1)
+    span = np.unique(in_spans, axis=0)[:, 0]             # of MAX_PAUSE frames, of each marker there
+    most = 2 * np.bincount(span, minlength=1).max()
     rows = 9 + 6 * most                                  # of the largest covariance of a filter
     at_once = max(1, int(MAX_ENTRIES / rows**2))
     found = []
@@ -235,8 +243,9 @@ def _learned_models(dataset, jumps, slip):
         are_poor = models.memory[best] > 0 or models.factor[best] > 1    # errors of the sightings
         least = TYPICAL_SLIP if are_poor else SLIP_BOUNDS[0]
         slips = np.unique(np.clip(models.slip[best] * FINE_STEPS, least, SLIP_BOUNDS[1]))
+    elsewhere = np.unique([False, models.elsewhere[best]])   # stretches say little of the camera
     return _all_models(
-        slips, [models.memory[best]], [models.elsewhere[best]], [models.factor[best]])
+        slips, [models.memory[best]], elsewhere, [models.factor[best]])
 
 
 def _all_models(slips, memories, elsewhere, factors):
@@ -288,16 +297,15 @@ def _filter(dataset, jumps, models):
     odometry = _odometry(dataset, jumps, frame[:-1], frame[1:])
     interval = np.diff(frame)
     usual = np.median(interval) if len(interval) else 1
-    memory = models.memory[:, None, None]
-    variance = models.factor[:, None, None]**2
+    memory = models.memory[:, None] ** (1 / usual)
+    variance = models.factor[:, None, None, None]**2
     state = _start(dataset.vehicle, models)
     state = _updated(state, sightings, 0, memory, variance)
     states = [state]
-    for k, length in enumerate(interval):
-        memory_left = memory ** (length / usual)
+    for k, steps in enumerate(interval):
         Q = odometry.noise(k, models.slip)
-        state = _predicted(state, odometry, k, Q, memory_left)
-        state = _updated(state, sightings, k + 1, memory_left, variance)
+        state = _predicted(state, odometry, k, Q, memory**steps)
+        state = _updated(state, sightings, k + 1, memory, variance)
         states.append(state)
     return states
 
@@ -317,37 +325,46 @@ def _start(vehicle, models):
         x=x,
         P=sigma[:, :, None]**2 * np.eye(9),
         marker=np.zeros(0, int),
+        row=np.zeros(0, int),
         z=np.zeros((0, 3)),
         log_density=models.log_prior())
 
 
 def _predicted(state, odometry, k, Q, memory):
-    """The _State after increment k by _Odometry, with noise Q (h, 3, 3).
-
-    Its last rows are the expected sightings M' + memory (z - M).
-    """
+    """The _State after increment k by _Odometry, with noise Q (h, 3, 3) and memory (h, 1)."""
+    count = len(memory)
+    unseen = len(state.marker) - len(state.z)
     X = state.x[:, 0]
-    M = state.x[:, 3:]
+    M = state.x[:, 3 + unseen:]
     delta = odometry.delta(k, state.x[:, 1])
     D, D_by_delta, D_by_camera = _in_camera(delta, state.x[:, 2])
     X_new, by_X, by_delta = se2.compose_with_jacobians(X, delta)
     M_new, M_by_D, M_by_M = se2.between_with_jacobians(D[:, None], M)
-    M_by_D = M_by_D.reshape(len(D), -1, 3)
-    L = np.zeros(state.P.shape[:2] + (3,))
-    L[:, POSE] = by_delta
-    L[:, MARKERS] = M_by_D @ D_by_delta
-    identity = np.broadcast_to(np.eye(9), (len(D), 9, 9))
-    F = _block_diagonal(identity, M_by_M)
-    F[:, POSE, POSE] = by_X
-    F[:, :, WHEELS] += L @ odometry.by_w[k]
-    F[:, MARKERS, CAMERA] += M_by_D @ D_by_camera
-    M_before = np.eye(F.shape[1])[MARKERS]
-    F = np.concatenate([F, F[:, MARKERS] - memory * M_before], axis=1)
-    L = np.concatenate([L, L[:, MARKERS]], axis=1)
-    expected = M_new + memory * se2.difference(state.z, M)
+    M_by_D = M_by_D.reshape(count, -1, 3)
+    M_by_delta = M_by_D @ D_by_delta
+    L = np.concatenate([by_delta, np.zeros((count, 6, 3)), M_by_delta, M_by_delta], axis=1)
+    by_w = L @ odometry.by_w[k]
+    M_by_camera = M_by_D @ D_by_camera
+    left = memory[:, :, None]
+
+    def moved(P):
+        """F P, with P (h, 9 + 3u + 3m, n)."""
+        of_X = by_X @ P[:, POSE]
+        last = P[:, 9:9 + 3 * unseen]
+        of_M = P[:, 9 + 3 * unseen:]
+        of_error = -left * of_M
+        of_error[:, :3 * unseen] += left * last
+        turned = M_by_M @ of_M.reshape(M.shape + P.shape[2:])
+        of_M = turned.reshape(of_M.shape) + M_by_camera @ P[:, CAMERA]
+        F_P = np.concatenate([of_X, P[:, SHARED], of_M, of_M + of_error], axis=1)
+        return F_P + by_w @ P[:, WHEELS]
+
+    z = np.tile(state.z, (count, 1, 1))
+    last = np.concatenate([state.x[:, 3:3 + unseen], z], axis=1)
+    expected = M_new + left * se2.difference(last, M)
     return state._replace(
         x=np.concatenate([X_new[:, None], state.x[:, 1:3], M_new, expected], axis=1),
-        P=F @ state.P @ F.mT + L @ Q @ L.mT)
+        P=moved(moved(state.P).mT) + L @ Q @ L.mT)
 
 
 def _in_camera(delta, camera):
@@ -359,34 +376,41 @@ def _in_camera(delta, camera):
 
 
 def _updated(state, sightings, row, memory, variance):
-    """The _State after the frame in this row of Sightings: with the markers seen there only.
+    """The _State after the frame in this row of Sightings: with the markers seen there or lately.
 
-    `variance` (h, 1, 1) is over that of the sightings.
+    `memory` (h, 1) is the correlation of errors after an encoder step, and `variance` (h, 1, 1, 1)
+    is over that of the sightings.
     """
     seen = np.arange(*np.searchsorted(sightings.row, [row, row + 1]))
     place, number = np.nonzero(sightings.marker[seen, None] == state.marker)
     known = seen[place]
     new = np.delete(seen, place)
-    new_part = variance * (1 - memory**2)
-    C = new_part[:, None] * sightings.C[known]
-    state, accepted = _measured(state, number, sightings.z[known], C)
-    z_new = np.tile(sightings.z[new], (len(memory), 1, 1))
+    is_unseen = row - state.row < MAX_PAUSE
+    is_unseen[number] = False
+    unseen = np.flatnonzero(is_unseen)
+    steps = sightings.frame[row] - sightings.frame[state.row[number]]
+    new_part = 1 - memory ** (2 * steps)
+    C = variance * new_part[:, :, None, None] * sightings.C[known]
+    state, accepted = _measured(state, unseen, number, sightings.z[known], C)
+    z_new = np.tile(sightings.z[new], (len(variance), 1, 1))
     used = np.append(known[accepted], new)
     return state._replace(
         x=np.concatenate([state.x, z_new], axis=1),
-        P=_block_diagonal(state.P, variance[:, None] * sightings.C[new]),
-        marker=sightings.marker[used],
+        P=_block_diagonal(state.P, variance * sightings.C[new]),
+        marker=np.append(state.marker[unseen], sightings.marker[used]),
+        row=np.append(state.row[unseen], sightings.row[used]),
         z=sightings.z[used])
 
 
-def _measured(state, number, z, C):
+def _measured(state, unseen, number, z, C):
     """The predicted _State after sightings z (m, 3) of markers, and which of them it accepts, (m,).
 
-    With covariances C (h, m, 3, 3); it keeps the accepted markers only. A sighting beyond the gate
-    of the likeliest filter is wrong. It is equally likely by all filters: as one at the gate by the
-    least certain.
+    With covariances C (h, m, 3, 3); it keeps the `unseen` markers and the accepted ones. A sighting
+    beyond the gate of the likeliest filter is wrong. It is equally likely by all filters: as one at
+    the gate by the least certain.
     """
-    expected = 3 + len(state.marker) + number
+    count = len(state.marker)
+    expected = 3 + count + number
     rows = _rows(expected)
     innovation = se2.difference(z, state.x[:, expected])
     S = state.P[:, rows[:, :, None], rows[:, None]] + C
@@ -397,7 +421,8 @@ def _measured(state, number, z, C):
     cost_of_wrong = np.minimum(by_certain, GATE + log_determinant.max(axis=0))
     cost = cost_of_wrong[:, ~accepted].sum(axis=1)
 
-    index = np.append([0, 1, 2], 3 + number[accepted])
+    index = np.concatenate(
+        [[0, 1, 2], 3 + count + unseen, 3 + unseen, 3 + number[accepted]])
     kept = _rows(index).ravel()
     H = rows[accepted].ravel()
     HP = state.P[:, H[:, None], kept]
