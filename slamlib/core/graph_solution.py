@@ -73,9 +73,7 @@ class Marginals:
         except RuntimeError:
             root, _ = self.tree.marginalFactor(key, gtsam.EliminateQR).jacobian()
             covariance = covariance_of_root(root, key)
-        if covariance.max() > MAX_VARIANCE:              # determined by rounding alone
-            raise undetermined(gtsam.DefaultKeyFormatter(key))
-        return covariance
+        return determined(covariance, key)
 
     def joint(self, first: int, second: int) -> np.ndarray:
         """The covariance (d, e) between two variables."""
@@ -87,13 +85,21 @@ class Marginals:
         keys = [first, second]
         try:
             joint = self.tree.jointMarginalCovariance(keys)
-            return np.block([[joint.at(row, column) for column in keys] for row in keys])
+            covariance = np.block([[joint.at(row, column) for column in keys] for row in keys])
         except RuntimeError:
             ordering = gtsam.Ordering()
             ordering.push_back(first)
             ordering.push_back(second)
             root, _ = self.tree.joint(first, second, gtsam.EliminateQR).jacobian(ordering)
-            return covariance_of_root(np.linalg.qr(root, mode="r"), first)
+            covariance = covariance_of_root(np.linalg.qr(root, mode="r"), first)
+        return determined(covariance, first)
+
+
+def determined(covariance: np.ndarray, near: int) -> np.ndarray:
+    """The covariance, unless rounding alone determines a variable: then raises DatasetError."""
+    if covariance.max() > MAX_VARIANCE:
+        raise undetermined(gtsam.DefaultKeyFormatter(near))
+    return covariance
 
 
 def covariance_of_root(root: np.ndarray, key: int) -> np.ndarray:

@@ -303,23 +303,21 @@ def solve_by_gtsam(fit: Fit) -> GtsamSolution:
         start = FROM_ENGINE
     values = found.values
     marginals = found.marginals
-    blocks = blocks_of(problem, values, marginals)
-    frames = [X(i) for i in problem.measurements.frame.tolist()]
-    pairs = [marginals.pair(first, second) for first, second in pairwise(frames)]
+    keys = [X(i) for i in problem.measurements.frame.tolist()]
+    pairs = np.reshape([marginals.pair(*both) for both in pairwise(keys)], (-1, 6, 6))
+    last = marginals.covariance(keys[-1])
     return GtsamSolution(
-        state=state_at(fit, values), frames=blocks[:len(frames)],
-        pairs=np.reshape(pairs, (-1, 6, 6)), landmarks=blocks[len(frames):],
+        state=state_at(fit, values), frames=np.concatenate([pairs[:, :3, :3], last[None]]),
+        pairs=pairs, landmarks=landmark_covariances(problem, values, marginals),
         c=calibration_covariance(problem, values, marginals),
         factors=graph.size(), variables=values.size(), steps=found.steps, start=start,
         converged=found.converged)
 
 
-def blocks_of(problem: Problem, values: gtsam.Values, marginals: Marginals) -> np.ndarray:
-    """Covariances (f + k + a, 3, 3) of all variables, zero of those that are not in the graph.
-
-    Such are markers without accepted sightings.
-    """
-    keys = variable_keys(problem)
+def landmark_covariances(problem: Problem, values: gtsam.Values,
+                         marginals: Marginals) -> np.ndarray:
+    """Covariances (k + a, 3, 3) of landmarks, zero of markers without accepted sightings."""
+    keys = variable_keys(problem)[len(problem.measurements.frame):]
     blocks = np.zeros((len(keys), 3, 3))
     for k, key in enumerate(keys):
         if values.exists(key):
