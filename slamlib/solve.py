@@ -344,12 +344,12 @@ def summarize(solved: Solution | Failure, truth: Truth | None) -> dict:
         return {"title": title, "doubts": [], "failed": solved.reason}
     known = np.flatnonzero(np.isfinite(solved.poses[:, 0]))
     world = int(known[0])
-    sigmas = evaluation.sigmas(solved.covariances[known])
-    position_sigmas = sigmas[:, :2].max(axis=1)
+    covariances = solved.covariances[known]
+    position_sigmas = evaluation.position_sigmas(covariances)
     row = {"title": title, "doubts": [asdict(doubt) for doubt in solved.doubts],
-           "estimated_poses": len(sigmas), "world_is_pose": world + 1,
+           "estimated_poses": len(known), "world_is_pose": world + 1,
            "last_sigma_m": position_sigmas[-1], "median_sigma_m": np.median(position_sigmas),
-           "median_sigma_heading_rad": np.median(sigmas[:, 2])}
+           "median_sigma_heading_rad": np.median(evaluation.sigmas(covariances)[:, 2])}
     row |= solved.facts
     if truth is not None:
         true = se2.between(truth.poses[world], truth.poses)

@@ -21,7 +21,6 @@ from slamlib import (
 )
 from slamlib.core import odometry, se2
 from slamlib.core.evaluation import anees, ate, position_sigmas
-from slamlib.core.increments import TYPICAL_SLIP
 from slamlib.core.records import Dataset, Truth
 from slamlib.robust.fit import refine
 from slamlib.robust.result import SlamResult, slam_result
@@ -112,7 +111,7 @@ def both_graphs(dataset: Dataset, result: SlamResult) -> Iterator[tuple]:
     The plain graph of a Dataset counts all measurements, its slip is typical. Of the `result` of
     `estimate` the poses are those that the plain graph has.
     """
-    decisions = count_everything(dataset, slip=TYPICAL_SLIP)
+    decisions = count_everything(dataset)
     plain = solve_graph(build_graph(decisions), initial_values(dataset, decisions))
     at = plain.pose
     yield "plain", at, plain.poses, plain.covariances
