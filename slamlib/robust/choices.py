@@ -382,7 +382,7 @@ def _with_jumps(dataset, start, decide, bump):
         are_told = (jumps.sigma < UNKNOWN_SIGMA).all()           # by markers
         if without is not None and are_told:
             is_led = _lead_of_jumps(fit, without) >= MIN_JUMP_LEAD
-            least = 0 if is_led else found + jumps.causes
+            least = -1 if is_led else found + jumps.causes
             if not spares_sightings(fit, without, "jumps", least):
                 fit = without
     elif found:
@@ -438,10 +438,10 @@ def has_rejected_visits(fit: Fit) -> bool:
 
 
 def spares_sightings(fit: Fit | None, other: Fit, explanation: str, least: float) -> bool:
-    """Whether a Fit accepts at least so many sightings that another rejects.
+    """Whether a Fit accepts so many sightings that another rejects, less those that it rejects.
 
-    It may reject hardly any that the other one accepts. A Fit that learns a far larger slip spares
-    them by this slip, not by its explanation.
+    These must be hardly any. A Fit that learns a far larger slip spares sightings by this slip, not
+    by its explanation.
     """
     if fit is None:
         return False
@@ -451,7 +451,7 @@ def spares_sightings(fit: Fit | None, other: Fit, explanation: str, least: float
     spared = np.count_nonzero(wrong_without & ~wrong)
     lost = np.count_nonzero(wrong & ~wrong_without)
     slips = fit.problem.noise.slip > max(USUAL_SLIP, MAX_SLIP_RATIO * other.problem.noise.slip)
-    is_believed = spared >= least and lost <= max(1, MAX_LOST * spared) and not slips
+    is_believed = spared - lost >= least and lost <= max(1, MAX_LOST * spared) and not slips
     log.info("%s: spare %d sightings, lose %d, slip %.3g mm after 1 m, %.3g without: %s",
              explanation, spared, lost, 1e3 * fit.problem.noise.slip,
              1e3 * other.problem.noise.slip, "believed" if is_believed else "not believed")
