@@ -113,8 +113,8 @@ def estimate(dataset: Dataset, slip: float | None = None, model: str | None = No
     result = replace(slam_result(fit), places=places)                                 # 7
     solution = result.gtsam
     log.info("GTSAM: slip %.3g mm after 1 m, %d factors, %d variables, %d steps from %s, "
-             "differs by up to %.2g sigmas", 1e3 * result.slip, solution.factors, solution.variables,
-             solution.steps, solution.start, result.disagreement)
+             "differs by up to %.2g sigmas", 1e3 * result.slip, solution.factors,
+             solution.variables, solution.steps, solution.start, result.disagreement)
     log.info("estimate of %s: %.1f s", dataset.name, time.perf_counter() - started)
     return result
 
