@@ -190,6 +190,22 @@ def test_points_are_mapped_as_positions(drive):
     assert_allclose(found.marker_in_world[:, :2], expected[:, :2], atol=0.05)
 
 
+def test_marginals_are_blocks_of_the_inverse_information(drive):
+    found = solve_graph(*plain(drive[0].first(60)))
+    chosen = [X(10), X(20), W(0)]
+    ordering = gtsam.Ordering()
+    for key in [*chosen, *sorted({*found.values.keys()} - {*chosen})]:
+        ordering.push_back(key)
+    information, _ = found.graph.linearize(found.values).hessian(ordering)
+    covariance = np.linalg.inv(information)
+    scale = np.sqrt(np.diag(covariance))
+    for part, block in ((found.marginals.covariance(X(10)), np.s_[:3, :3]),
+                        (found.marginals.pair(X(10), X(20)), np.s_[:6, :6]),
+                        (found.marginals.joint(X(20), W(0)), np.s_[3:6, 6:9])):
+        off = (part - covariance[block]) / (scale[:, None] * scale)[block]
+        assert np.abs(off).max() < 1e-5
+
+
 def test_where_cholesky_fails_qr_gives_the_same_solution_and_marginals(drive, monkeypatch):
     graph, values = plain(drive[0].first(200))
     expected = solve_graph(graph, values)

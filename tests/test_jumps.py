@@ -222,6 +222,13 @@ def test_no_jump_in_clean_drives(change, options):
         assert not len(jumps.find_jumps(replace(dataset, aruco=change(dataset.aruco))).start)
 
 
+def test_two_wrong_labels_of_the_first_image_that_agree_are_no_jump():
+    """It would spare both: pose 1 alone can be anywhere. But it rejects a right one."""
+    dataset = short(22, mislabelled=0.15)[0].without("uwb")
+    assert len(jumps.find_jumps(dataset).start) == 1
+    assert not len(estimate(dataset).jumps.start)
+
+
 def test_turns_on_the_spot_under_a_camera_that_looks_ahead_are_no_breaks():
     """Within a frame or two all markers leave the image, and others come."""
     def ahead(z):
