@@ -31,29 +31,29 @@ MAX_ANTENNA_ERROR = 0.5      # m, error below which an antenna is right
 MAX_MARKER_ERROR = 0.1       # m, distance from the right optimum above which a marker is off
 
 
-def measure_with_known_noise(dataset: Dataset) -> Measurements:
-    """The Measurements of a Dataset with the typical slip and the sigmas of the files."""
+def measure_with_known_noise(dataset: Dataset, kernel: str = "asymmetric Tukey") -> Measurements:
+    """The Measurements of a Dataset with the typical slip, the sigmas of the files and a kernel."""
     vehicle = replace(dataset.vehicle, slip=TYPICAL_SLIP, marker_noise_factor=1.0,
-                      range_noise_factor=1.0)
+                      range_noise_factor=1.0, kernel=kernel)
     return measure(replace(dataset, vehicle=vehicle))
 
 
-def solve_with(measurements: Measurements, ranges: str = "asymmetric Tukey",
-               antennas=trilaterated_antennas) -> Fit:
-    """The Fit from odometry by arcs, by a kernel of the ranges; sightings have the gate.
+def solve_with(measurements: Measurements, antennas=trilaterated_antennas) -> Fit:
+    """The Fit from odometry by arcs, by the stated kernel; only sightings have the gate.
 
-    Kernels that narrow come first. The noise of the measurements is known. The default is that of
-    `estimate`; `antennas` as of `initialization.state_from_poses`.
+    Kernels that narrow come first. The noise of the measurements is known; `antennas` as of
+    `initialization.state_from_poses`.
     """
+    kernel = measurements.dataset.vehicle.kernel
     problem = build_problem(measurements, "arc")
     start = narrow_kernels(problem, odometry_state(measurements, "arc", antennas=antennas))
-    accept = partial(accepted_measurements, sightings=("quadratic", True),
-                     ranges=(ranges, ranges in ONE_SIDED_BIAS))
+    accept = partial(accepted_measurements, sightings=(kernel, True),
+                     ranges=(kernel, kernel in ONE_SIDED_BIAS))
     return refine(problem, start, accept)
 
 
 def compare(seed: int, methods: tuple, **options) -> dict:
-    """Kernels of the ranges (names) on one drive; slip and arcs given.
+    """Kernels (names) on one drive; slip and arcs given.
 
     Returns
     -------
@@ -61,10 +61,9 @@ def compare(seed: int, methods: tuple, **options) -> dict:
     poses and "antenna nees".
     """
     dataset, truth = simulate(seed=seed, **options)
-    measurements = measure_with_known_noise(dataset)
     numbers = {}
     for method in methods:
-        found = slam_result(solve_with(measurements, method))
+        found = slam_result(solve_with(measure_with_known_noise(dataset, method)))
         numbers |= judged(method, found.poses, found.covariances, truth.poses)
         error, nees = antenna_error(found, truth)
         numbers[f"{method} antenna error"] = np.sqrt(np.mean(error**2))
