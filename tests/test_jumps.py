@@ -28,8 +28,11 @@ from slamlib.core.evaluation import ate
 from slamlib.core.odometry import dead_reckoning
 from slamlib.core.records import Dataset
 from slamlib.robust import jumps
+from slamlib.robust.choices import with_stretched
 from slamlib.robust.factors import odometry_error, preintegrate_odometry
 from slamlib.robust.fused import fuse
+from slamlib.robust.initialization import odometry_state
+from slamlib.robust.linear import build_problem
 from slamlib.robust.measurements import measure
 from slamlib.robust.solution_doubts import _encoder_doubts, solution_doubts
 from slamlib.studies.simulation import TABLE_2, manoeuvre, simulate
@@ -68,6 +71,21 @@ def test_a_jump_of_a_vehicle_that_stands_is_found_where_it_is():
     assert_allclose(found.mended(np.arange(12), np.zeros((12, 3))), poses, atol=1e-6)
 
 
+def test_a_step_that_stretches_odometry_is_one_more_jump():
+    """The larger one of two; none while poses are those by odometry."""
+    poses = np.zeros((12, 3))
+    problem = build_problem(measure(seen(poses)), "arc")
+    state = odometry_state(problem.measurements, "arc")
+    assert with_stretched(SimpleNamespace(problem=problem, state=state)) is None
+    poses[4:, :2] = [0.4, 0.3]
+    poses[9:, :2] = [0.4, 0.4]
+    state = replace(state, poses=poses)
+    found = with_stretched(SimpleNamespace(problem=problem, state=state))
+    assert found.start.tolist() == [3] and found.end.tolist() == [4]
+    assert_allclose(found.increment, [[0.4, 0.3, 0]])
+    assert_allclose(found.by_odometry, 0)
+
+
 @pytest.mark.parametrize("contradicted, dead", [([3], []), ([2, 3, 7], [1, 2, 3, 4, 5, 6, 7])])
 def test_a_dead_wheel_by_hand(contradicted, dead):
     """Zeros from row 10 to 26; of the other wheel from 35 on: steps 2 to 4 and 7 are silent."""
@@ -89,8 +107,7 @@ def test_a_jump_is_where_most_contradicting_pairs_span_it():
 def test_shares_of_a_jump_by_hand():
     """A jump in one of four steps; of the steps 3, 4, 5 and 6 the second has a spike."""
     jump = np.array([0.4, 0.0, 0.2])
-    found = replace(jumps.NO_JUMPS, chance=np.arange(9.0))._with(
-        start=2, end=6, increment=jump, by_odometry=0 * jump, sigma=jumps._sigma_of(jump))
+    found = jumps.NO_JUMPS.joined_by(2, 6, jump, 0 * jump, count=9)
     start = np.array([0, 2, 3, 0, 6])
     end = np.array([2, 3, 6, 8, 8])
     assert_allclose(found.share(start, end)[:, 0], [0, 0.25, 0.75, 1, 0])

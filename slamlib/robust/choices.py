@@ -31,11 +31,12 @@ import numpy as np
 from slamlib.core import se2
 from slamlib.core.errors import DatasetError
 from slamlib.core.records import ArucoReadings, Dataset
-from slamlib.robust.calibration import RADII, WHEEL_SCALE, Prior
+from slamlib.core.sightings import GATE
+from slamlib.robust.calibration import RADII, WHEEL_SCALE, WHEELS, Prior
 from slamlib.robust.error_memory import runs
-from slamlib.robust.factors import preintegrate_odometry
+from slamlib.robust.factors import odometry_error, preintegrate_odometry
 from slamlib.robust.fit import Fit, accepted_measurements, refine, residuals
-from slamlib.robust.jumps import UNKNOWN_SIGMA, find_jumps
+from slamlib.robust.jumps import UNKNOWN_SIGMA, Jumps, find_jumps
 from slamlib.robust.linear import (
     NormalEquations,
     Problem,
@@ -57,7 +58,7 @@ AMBIGUOUS = 3.0              # log evidence within which explanations cannot be 
 MAX_GROUPS = 5               # number of groups that are wrong at once
 MIN_INFORMATION = 1e-3       # about an entry, in wide sigmas, below which it is not considered
 MAX_PROPOSALS = 5            # number of sets that are solved
-MIN_JUMP_LEAD = 10.0         # log evidence by which jumps or a motion of the camera are believed
+MIN_JUMP_LEAD = 10.0         # log evidence by which a jump found at the solution is believed
 
 PLAUSIBLE_FACTOR = 2.0       # on standard deviations, beyond which a sensor is not believed slow
 MAX_STILL_CONTRADICTING = 0.5    # of these, by the slip that is believed
@@ -341,7 +342,9 @@ def most_consistent(
     is `like`, and `decide` decides. Jumps of odometry, or else places of ids, are believed where
     they spare sightings that are rejected without them, with the same decisions. A few jumps are
     also believed if the evidence leads and hardly any sighting contradicts them instead, or no
-    marker tells them; a camera that was moved, if the evidence leads.
+    marker tells them; a camera that was moved, if the evidence leads. Where a solution stretches
+    odometry beyond the slip that it learned, most of all over a way without markers, one more jump
+    is believed if the evidence leads decisively.
     """
     bump = camera_bump(dataset)
     fit = _with_jumps(dataset, start, decide, bump)
@@ -357,6 +360,9 @@ def most_consistent(
             alternative = _alternative(start, fit, no_jumps, places)
             if spares_sightings(alternative, fit, "places of ids", MIN_SPARED * count):
                 return decide(start(no_jumps, places)), places
+    jumps = with_stretched(fit)
+    if jumps is not None and _lead_of_jumps(_alternative(start, fit, jumps), fit) > MIN_JUMP_LEAD:
+        return decide(start(jumps)), None
     return fit, None
 
 
@@ -394,13 +400,36 @@ def _with_jumps(dataset, start, decide, bump):
 
 
 def _lead_of_jumps(fit, other):
-    """Log evidence of a Fit with more jumps over that of another."""
+    """Log evidence of a Fit with more jumps over that of another, none if there is no solution."""
+    if fit is None:
+        return -np.inf
     try:
         lead = _lead(fit, other)
     except (DatasetError, np.linalg.LinAlgError):        # by what both accept
         return -np.inf
     log.info("jumps: log evidence %+.1f", lead)
     return lead
+
+
+def with_stretched(fit: Fit) -> Jumps | None:
+    """The Jumps of a Fit and the step that contradicts odometry most, None if that is within GATE.
+
+    Data snooping (Baarda 1968) with the slip that is learned. There is no such step where it is
+    given.
+    """
+    m = fit.problem.measurements
+    if not m.learned[0] or not len(m.marker_row) or len(m.frame) < 2:
+        return None
+    odometry = fit.problem.odometry
+    poses = fit.state.poses
+    e = odometry_error(odometry, poses, fit.state.c[WHEELS])[0]
+    squared = se2.squared_norms(e, odometry.covariance(fit.problem.noise.slip))
+    k = int(squared.argmax())
+    if squared[k] > GATE:
+        return m.jumps.joined_by(
+            m.frame[k], m.frame[k + 1], se2.between(poses[k], poses[k + 1]),
+            odometry.increment[k], len(m.dataset.ticks))
+    return None
 
 
 def visits(aruco: ArucoReadings) -> np.ndarray:

@@ -113,6 +113,17 @@ class Jumps:
         variance = share @ self.sigma**2
         return motion, variance[:, :, None] * np.eye(3)
 
+    def joined_by(self, start: int, end: int, increment: np.ndarray, by_odometry: np.ndarray,
+                  count: int) -> "Jumps":
+        """The Jumps and one more, of `count` encoder poses."""
+        jump = se2.compose(increment, se2.inverse(by_odometry))
+        chance = self.chance
+        if not len(self.start):
+            chance = np.arange(float(count))
+        return replace(self, chance=chance)._with(
+            start=start, end=end, increment=increment, by_odometry=by_odometry,
+            sigma=_sigma_of(jump))
+
     def _with(self, **jump):
         """The Jumps and one more, of which all fields with a row for each are given."""
         k = np.searchsorted(self.start, jump["start"])
