@@ -266,9 +266,9 @@ def test_standard_deviations_in_the_columns_of_variances_are_recognised(spoil, i
 
 def test_a_factor_on_both_radii_correlates_them():
     stated = calibration.stated_calibration(Vehicle(), [])
-    prior = stated.prior(["wheel-scale"])
+    prior = stated.prior(["wheel-scale"], width=2.0)
     expected = np.diag(stated.sigma**2)
-    expected[:2, :2] += 0.05**2 * 0.1**2
+    expected[:2, :2] += 0.1**2 * 0.1**2
     assert_allclose(prior.root @ prior.root.T, expected)
     u = np.array([0.3, -0.2, 0.5])
     assert_allclose(prior.unknowns(prior.of(slice(None)) @ u), u)

@@ -88,6 +88,26 @@ def test_slow_errors_of_a_sensor_are_no_slip():
     assert aligned_ate(found, truth) < 0.012     # 0.026 by slip
 
 
+def shaken(dataset, sigma, poses):
+    """The Dataset whose camera moves ahead and back by `sigma` m, alike for that many poses."""
+    rng = np.random.default_rng(1)
+    ahead = np.convolve(rng.standard_normal(len(dataset.ticks)), np.ones(poses), "same")
+    off = np.outer(sigma / poses**0.5 * ahead[dataset.aruco.pose], [1, 0, 0])
+    return aruco(dataset, marker_in_vehicle=dataset.aruco.marker_in_vehicle + off)
+
+
+def test_a_camera_that_shakes_is_no_slip():
+    """All markers move alike, as if the vehicle did: 0.08 m of slip would explain it."""
+    dataset, truth = short(5)
+    dataset = shaken(dataset, 0.03, poses=30)
+    without = dataset.without("uwb")
+    found = estimate(without)
+    assert aligned_ate(found, truth) < 0.012     # 0.028 by slip
+    assert mean_nees(found, truth) < 6           # 12
+    assert "camera-shakes" in [doubt.what for doubt in solution_doubts(found)]
+    assert estimate(dataset, previous=found).slip == found.slip
+
+
 def test_a_large_slip_is_no_error_of_a_sensor():
     dataset, truth = short(1, slip=0.03)
     found = estimate(dataset.without("uwb"))

@@ -154,4 +154,4 @@ def test_at_returns_slam_is_compared_by_the_camera_that_it_estimated(tmp_path):
     odometry, slam, noise = (float(rows["x", name][0]) for name in (
         "odometry", "SLAM: odometry + ArUco", "noise of the sightings alone"))
     assert slam < 1.5 * noise < odometry
-    assert "those at returns" in text
+    assert "*At returns* is" in text

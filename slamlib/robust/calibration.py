@@ -96,16 +96,16 @@ class Calibration:
             return np.arange(len(self.names)) < RADII.stop
         return self.group == group
 
-    def prior(self, groups: Collection[str] = ()) -> "Prior":
-        """The Prior, of `groups` with the wide standard deviations."""
+    def prior(self, groups: Collection[str] = (), width: float = 1.0) -> "Prior":
+        """The Prior, of `groups` with the wide standard deviations times `width`."""
         released = np.isin(self.group, list(groups))
-        sigma = np.where(released, np.maximum(self.wide, self.sigma), self.sigma)
+        sigma = np.where(released, np.maximum(width * self.wide, self.sigma), self.sigma)
         root = np.diag(sigma)
         if WHEEL_SCALE in groups:
-            common = WIDE_SCALE * self.stated[RADII]
+            common = width * WIDE_SCALE * self.stated[RADII]
             covariance = np.diag(sigma[RADII]**2) + np.outer(common, common)
             root[RADII, RADII] = np.linalg.cholesky(covariance)
-        return Prior(groups=frozenset(groups), root=root)
+        return Prior(groups=frozenset(groups), width=width, root=root)
 
     def taken_from(self, other: "Calibration", values: np.ndarray) -> np.ndarray:
         """Values (p,) of another drive's Calibration where it has the entry, else as stated."""
@@ -121,6 +121,7 @@ class Prior:
     """
 
     groups: frozenset        # that leave their stated values
+    width: float             # of their wide standard deviations
     root: np.ndarray         # (p, p) lower triangular, 0 in rows and columns of what is known
 
     @property

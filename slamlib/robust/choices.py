@@ -30,6 +30,7 @@ import numpy as np
 
 from slamlib.core import se2
 from slamlib.core.errors import DatasetError
+from slamlib.core.odometry import cumulative
 from slamlib.core.records import ArucoReadings, Dataset
 from slamlib.core.sightings import GATE
 from slamlib.robust.calibration import RADII, WHEEL_SCALE, WHEELS, Prior
@@ -44,7 +45,7 @@ from slamlib.robust.linear import (
     laplace_approximation,
     linear_solution,
 )
-from slamlib.robust.measurements import AcceptedMeasurements
+from slamlib.robust.measurements import AcceptedMeasurements, with_known
 from slamlib.robust.part_faults import camera_bump
 from slamlib.robust.result import slam_result
 
@@ -56,11 +57,18 @@ FURTHER_ENTRY = 0.5          # log evidence beside it, for each entry of a group
 STATED = 3.0                 # log evidence beside it, if standard deviations are stated
 AMBIGUOUS = 3.0              # log evidence within which explanations cannot be told apart
 MAX_GROUPS = 5               # number of groups that are wrong at once
+MAX_WIDE_SIGMAS = 4.0        # wide sigmas, of an entry; beyond them a statement is grossly wrong
+GROSS = 10.0                 # factor on the wide sigmas beyond MAX_WIDE_SIGMAS
 MIN_INFORMATION = 1e-3       # about an entry, in wide sigmas, below which it is not considered
 MAX_PROPOSALS = 5            # number of sets that are solved
 MIN_JUMP_LEAD = 10.0         # log evidence by which a jump found at the solution is believed
 
 PLAUSIBLE_FACTOR = 2.0       # on standard deviations, beyond which a sensor is not believed slow
+MIN_SHAKEN_SLIP = 0.01       # sqrt(m), from which on a camera that shakes may be the cause
+SHAKEN_SPAN = 40             # number of increments in a sum that tells slip from shaking
+MIN_SHAKEN_SPANS = 3         # of these, on which it is judged
+MAX_VARIANCE_RATIO = 0.35    # of the sum, over that of independent increments
+HELD_SLIP = 3e-3             # sqrt(m), of wheels under a camera that shakes
 MAX_STILL_CONTRADICTING = 0.5    # of these, by the slip that is believed
 MAX_CONTRADICTING = 0.01     # share of the measurements, by which a small slip may contradict more
 
@@ -68,7 +76,6 @@ VISIT_GAP = 30               # typical intervals between sightings of a marker, 
 MIN_VISIT = 3                # number of accepted sightings of a visit that is compared
 MAX_REJECTED_SHARE = 0.5     # of the sightings of a visit
 MAX_SLIP_RATIO = 2.0         # of the slips with and without an explanation that is believed
-USUAL_SLIP = 0.01            # sqrt(m), up to which the slip may grow by more
 MIN_SPARED = 2               # number of sightings, by each place of an id that is believed
 MAX_LOST = 0.1               # of these, number that may be rejected instead
 PLACE_GATE = 60.0            # squared distance of x, y, heading in sigmas, beyond it another place
@@ -81,7 +88,18 @@ def memory_or_slip(problem: Problem, state: State) -> Fit:
     Slow errors of sensors bend the path as a large slip does. A small slip is more probable, so
     memory is sought first, unless measurements then contradict the path even if their standard
     deviations were PLAUSIBLE_FACTOR times those in the files, where with a larger slip they do not.
+    A camera that shakes bends it, too, but not for long: then the slip is HELD_SLIP.
     """
+    fit = _by_memory_or_slip(problem, state)
+    if not is_shaken(fit):
+        return fit
+    log.info("slip %.3g mm after 1 m does not accumulate: the camera shakes",
+             1e3 * fit.problem.noise.slip)
+    return refine(with_held_slip(problem), state)
+
+
+def _by_memory_or_slip(problem, state):
+    """The Fit by memory first, or by slip first."""
     fit = refine(problem, state)
     if not (fit.problem.accepted.share < 1).any():
         return fit
@@ -95,6 +113,40 @@ def memory_or_slip(problem: Problem, state: State) -> Fit:
              "%%: %s", 1e3 * fit.problem.noise.slip, 100 * by_memory,
              1e3 * other.problem.noise.slip, 100 * by_slip, "slip" if is_slip else "memory")
     return other if is_slip else fit
+
+
+def is_shaken(fit: Fit) -> bool:
+    """Whether the learned slip is large, and errors of odometry do not accumulate as slips do.
+
+    An error that all markers of an image share, as where the camera tilts, moves the path there and
+    back again. The variance of the sum of independent slips grows with the number of steps, that
+    of such errors does not (variance ratio: Lo and MacKinlay, Rev. Financial Studies 1(1), 1988).
+    Rounding of coarse counts does not accumulate, either, but is odometry's.
+    """
+    problem = fit.problem
+    slip = problem.noise.slip
+    if not problem.measurements.learned[0] or slip < MIN_SHAKEN_SLIP:
+        return False
+    error = odometry_error(problem.odometry, fit.state.poses, fit.state.c[WHEELS])[0]
+    sigma = np.sqrt(problem.odometry.covariance(slip)[:, 0, 0])
+    if np.median(sigma) < problem.measurements.dataset.vehicle.metres_per_count.max():
+        return False
+    along = error[:, 0] / sigma
+    total = cumulative(along)
+    sums = total[SHAKEN_SPAN:] - total[:-SHAKEN_SPAN]
+    if len(sums) < MIN_SHAKEN_SPANS * SHAKEN_SPAN:
+        return False
+    ratio = np.mean(sums**2) / (SHAKEN_SPAN * np.mean(along**2))
+    return bool(ratio < MAX_VARIANCE_RATIO)
+
+
+def with_held_slip(problem: Problem) -> Problem:
+    """The Problem of a drive with a camera that shakes, whose slip is known to be HELD_SLIP."""
+    m = problem.measurements
+    vehicle = replace(m.dataset.vehicle, slip=HELD_SLIP)
+    held = replace(m, dataset=replace(m.dataset, vehicle=vehicle))
+    return replace(problem, measurements=held, noise=with_known(problem.noise, vehicle),
+                   is_shaken=True)
 
 
 def _contradicting_share(fit):
@@ -196,6 +248,7 @@ class _Sets(NamedTuple):
     evidence: np.ndarray         # (s,) log evidence
     merit: np.ndarray            # (s,) log evidence less the prices of the groups
     surprise: np.ndarray         # (s,) part of the prices, of groups that are stated in full
+    furthest: np.ndarray         # (s,) largest posterior mean of what is released, in its sigmas
 
 
 def _proposal(fit):
@@ -203,36 +256,46 @@ def _proposal(fit):
 
     `explanations` are the best set of groups and others that the drive cannot tell from it, neither
     part of it nor more. The prior releases all their groups, and what else raises the evidence: not
-    certain enough to be told, but the covariances include it.
+    certain enough to be told, but the covariances include it. Wide standard deviations are
+    multiplied by GROSS if an entry that is released would be further off than MAX_WIDE_SIGMAS.
     """
     calibration = fit.problem.measurements.calibration
     L, h = _likelihood(fit)
-    sets = _sets(calibration, L, h)
-    k = int(sets.merit.argmax())
-    best = sets.groups[k]
+    for width in (1.0, GROSS):
+        sets = _sets(calibration, L, h, width)
+        k = int(sets.merit.argmax())
+        best = sets.groups[k]
+        if not best or sets.furthest[k] < MAX_WIDE_SIGMAS:
+            break
     told = _as_likely(sets, k)
     explanations = tuple(some for some in told if not (some < best or some > best))
     k = _released_set(sets, certain=frozenset().union(*told), default=k)
-    present = _log_evidence(L, h, _in_wide_sigmas(calibration, L, fit.problem.prior.root))
+    present = _log_evidence(L, h, _in_wide_sigmas(calibration, L, fit.problem.prior.root))[0]
     return _Proposal(explanations, sets.priors[k], sets.evidence[k] - present)
 
 
-def _sets(calibration, L, h):
-    """The _Sets of up to MAX_GROUPS groups of which the likelihood of L (p, p), h (p,) tells."""
+def _sets(calibration, L, h, width):
+    """The _Sets of up to MAX_GROUPS groups of which the likelihood of L (p, p), h (p,) tells.
+
+    Their wide standard deviations are multiplied by a width.
+    """
     doubtful = (np.diag(L) > 0) & (calibration.wide > calibration.sigma)
     groups = np.unique(calibration.group[doubtful]).tolist()
     if doubtful[RADII].all():
         groups.append(WHEEL_SCALE)
     sets = [frozenset(some) for count in range(MAX_GROUPS + 1)
             for some in combinations(groups, count)]
-    priors = [calibration.prior(some) for some in sets]
-    roots = np.array([prior.root for prior in priors])
-    evidence = _log_evidence(L, h, _in_wide_sigmas(calibration, L, roots))
+    priors = [calibration.prior(some, width) for some in sets]
+    given = np.array([prior.root for prior in priors])
+    is_released = np.diagonal(given, axis1=1, axis2=2) > calibration.sigma
+    roots = _in_wide_sigmas(calibration, L, given)
+    evidence, mean = _log_evidence(L, h, roots)
     price = {group: _price(calibration, group) for group in groups}
     surprise = {group: _surprise(calibration, group) for group in groups}
     prices = np.array([sum(price[group] for group in some) for some in sets])
     surprises = np.array([sum(surprise[group] for group in some) for some in sets])
-    return _Sets(sets, priors, evidence, evidence - prices, surprises)
+    return _Sets(sets, priors, evidence, evidence - prices, surprises,
+                 furthest=np.max(np.abs(mean), axis=1, where=is_released, initial=0.0))
 
 
 def _as_likely(sets, best):
@@ -280,19 +343,21 @@ def _surprise(calibration, group):
 def _log_evidence(L, h, root):
     """Log evidences (...) of priors with roots (..., p, p), as of a Prior.
 
-    From the information L (p, p) and h (p,) of the likelihood.
+    From the information L (p, p) and h (p,) of the likelihood. Also the posterior means (..., p) of
+    the unknowns, in their standard deviations, in which the equations are solved.
     """
     information = np.eye(len(h)) + root.mT @ L @ root
     gradient = h @ root
     mean = np.linalg.solve(information, gradient[..., None])[..., 0]
     log_determinant = np.linalg.slogdet(information).logabsdet
-    return np.sum(gradient * mean, axis=-1) / 2 - log_determinant / 2
+    evidence = np.sum(gradient * mean, axis=-1) / 2 - log_determinant / 2
+    return evidence, mean
 
 
 def _likelihood(fit):
     """Information L (p, p) and h (p,) about the calibration, in wide sigmas from what is stated."""
     calibration = fit.problem.measurements.calibration
-    wide = Prior(frozenset(), np.diag(calibration.wide))
+    wide = Prior(frozenset(), 1.0, np.diag(calibration.wide))
     equations = NormalEquations(replace(fit.problem, prior=wide), fit.state)
     sums = equations.sums(fit.problem.noise, consistent=True)
     solution = linear_solution(equations.structure, sums)
@@ -479,7 +544,7 @@ def spares_sightings(fit: Fit | None, other: Fit, explanation: str, least: float
     wrong_without = contradicted(other, factor)
     spared = np.count_nonzero(wrong_without & ~wrong)
     lost = np.count_nonzero(wrong & ~wrong_without)
-    slips = fit.problem.noise.slip > max(USUAL_SLIP, MAX_SLIP_RATIO * other.problem.noise.slip)
+    slips = fit.problem.noise.slip > max(MIN_SHAKEN_SLIP, MAX_SLIP_RATIO * other.problem.noise.slip)
     is_believed = spared - lost >= least and lost <= max(1, MAX_LOST * spared) and not slips
     log.info("%s: spare %d sightings, lose %d, slip %.3g mm after 1 m, %.3g without: %s",
              explanation, spared, lost, 1e3 * fit.problem.noise.slip,

@@ -78,6 +78,7 @@ class Problem:
     noise: Noise
     prior: Prior             # of the calibration
     memory_first: bool = True    # whether slow errors are sought before the noise is learned
+    is_shaken: bool = False      # whether the camera shakes, so that the slip is not learned
 
     @property
     def active(self) -> np.ndarray:

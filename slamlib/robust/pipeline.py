@@ -22,6 +22,7 @@ from slamlib.robust.choices import (
     calibrated,
     memory_or_slip,
     most_consistent,
+    with_held_slip,
 )
 from slamlib.robust.fit import CAUCHY_SCALES, Fit, narrow_kernels, refine, settled
 from slamlib.robust.initialization import initial_state, state_from_poses
@@ -150,6 +151,8 @@ def fit_from_odometry(measurements: Measurements, model: str = "arc",
 
 def decided_like(problem: Problem, decided: Problem, prior: Prior) -> Problem:
     """The Problem with a prior of the calibration, and what else another one has decided."""
+    if decided.is_shaken:
+        problem = with_held_slip(problem)
     return replace(problem, prior=prior, memory_first=decided.memory_first)
 
 
@@ -159,7 +162,7 @@ def fit_from_previous(measurements: Measurements, previous: SlamResult,
     m = measurements
     problem = build_problem(m, model or previous.model, Noise(previous.slip), previous.wheel)
     decided = previous.fit.problem
-    prior = m.calibration.prior(decided.prior.groups)
+    prior = m.calibration.prior(decided.prior.groups, decided.prior.width)
     problem = decided_like(problem, decided, prior)
     c = m.calibration.taken_from(previous.calibration, previous.c)
     state = state_from_poses(m, previous.poses[m.frame], previous.covariances[m.frame], c)

@@ -299,7 +299,14 @@ def _slip_doubt(slip):
 
 
 def _path_doubts(result):
-    """Doubts on slip, and on a solution that still changed."""
+    """Doubts on slip, and a solution that still changed."""
+    if result.fit.problem.is_shaken:
+        yield Doubt("camera-shakes", (
+            "Errors of all markers of an image are alike. They move the path to and fro as a large "
+            "slip would, but do not accumulate as slip does: problems 3 and 4 take the slip to be "
+            f"{1e3 * result.slip:.0f} mm (one standard deviation) after one metre."), (
+            "Look whether the camera tilts or shakes while the vehicle moves, and state the slip "
+            "in vehicle.toml."))
     if result.noise_sigma[0]:
         yield from _slip_doubt(result.slip)
     if not result.converged:
