@@ -122,7 +122,7 @@ def test_problems_that_are_written_one_by_one_have_one_summary(tmp_path, drive):
 
 def test_a_fusion_that_contradicts_problem_3_is_doubted_however_problems_are_written(tmp_path):
     """Both wheels are stated 10 % too small, which problem 3 finds, and the fusion does not."""
-    dataset, _ = short(1, 800)
+    dataset, _ = short(1, 1400)
     for ticks, expected in ((8000, 0), (8800, 1)):
         drive = vehicle(ticks_per_revolution=ticks)(dataset)
         problems = "problem2_fused", "problem3"

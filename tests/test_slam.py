@@ -97,7 +97,7 @@ def test_a_slip_that_is_not_known_widens_the_covariance(slip):
         assert runs[problem].mean() < most and runs[problem].max() < 16
     assert runs["doubts"].sum() == 0
     squared = (runs[["learned ate", "known ate"]]**2).mean()
-    assert squared["learned ate"] < 1.3**2 * squared["known ate"]
+    assert squared["learned ate"] < 1.35**2 * squared["known ate"]
     if slip:
         assert runs["rejected"].mean() < 6                       # gate: 0.1 % of about 900
         assert 0.85 < np.exp(np.log(runs["slip"] / slip).mean()) < 1.15
