@@ -532,10 +532,10 @@ def has_rejected_visits(fit: Fit) -> bool:
 
 
 def spares_sightings(fit: Fit | None, other: Fit, explanation: str, least: float) -> bool:
-    """Whether a Fit accepts so many sightings that another rejects, less those that it rejects.
+    """Whether a Fit spares at least so many sightings more than it loses.
 
-    These must be hardly any. A Fit that learns a far larger slip spares sightings by this slip, not
-    by its explanation.
+    It spares one that another Fit rejects, and loses one that the other accepts; it may lose hardly
+    any. A Fit that learns a far larger slip spares them by this slip, not by its explanation.
     """
     if fit is None:
         return False

@@ -349,14 +349,13 @@ def _predicted(state, odometry, k, Q, memory):
 
     def moved(P):
         """F P, with P (h, 9 + 3u + 3m, n)."""
-        of_X = by_X @ P[:, POSE]
-        last = P[:, 9:9 + 3 * unseen]
-        of_M = P[:, 9 + 3 * unseen:]
-        of_error = -left * of_M
-        of_error[:, :3 * unseen] += left * last
-        turned = M_by_M @ of_M.reshape(M.shape + P.shape[2:])
-        of_M = turned.reshape(of_M.shape) + M_by_camera @ P[:, CAMERA]
-        F_P = np.concatenate([of_X, P[:, SHARED], of_M, of_M + of_error], axis=1)
+        before = P[:, 9 + 3 * unseen:]                   # of the markers
+        error = -before                                  # Z - M, of which only an expected Z varies
+        error[:, :3 * unseen] += P[:, 9:9 + 3 * unseen]
+        turned = M_by_M @ before.reshape(M.shape + P.shape[2:])
+        after = turned.reshape(before.shape) + M_by_camera @ P[:, CAMERA]
+        F_P = np.concatenate(
+            [by_X @ P[:, POSE], P[:, SHARED], after, after + left * error], axis=1)
         return F_P + by_w @ P[:, WHEELS]
 
     z = np.tile(state.z, (count, 1, 1))

@@ -331,8 +331,9 @@ def interpolate(problem: Problem, solution: GtsamSolution) -> tuple[np.ndarray, 
     by_a = se2.compose_jacobians(state.poses[a], since_a)[0] @ to_world[a]
     by_motion = gain_b @ after.by_frame @ to_world[a + 1]
     by_wheel = gain_a @ before.by_wheel + gain_b @ after.by_wheel
-    common = by_a @ with_motion[a] @ by_motion.mT
-    covariances[inner] = (
-        by_a @ own[a] @ by_a.mT + common + common.mT + by_motion @ of_motion[a] @ by_motion.mT
-        + by_wheel @ wheels @ by_wheel.mT + gain_a @ N_a)
+    of_frame = by_a @ own[a] @ by_a.mT
+    between = by_a @ with_motion[a] @ by_motion.mT
+    of_frames = of_frame + between + between.mT + by_motion @ of_motion[a] @ by_motion.mT
+    of_wheels = by_wheel @ wheels @ by_wheel.mT
+    covariances[inner] = of_frames + of_wheels + gain_a @ N_a
     return poses, (covariances + covariances.mT) / 2
