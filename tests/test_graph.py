@@ -1,6 +1,7 @@
 """The factor graph in GTSAM: its factors, its solution, and factors of one's own."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import gtsam
 import numpy as np
@@ -193,6 +194,7 @@ def test_points_are_mapped_as_positions(drive):
 def test_marginals_are_blocks_of_the_inverse_information(drive):
     found = solve_graph(*plain(drive[0].first(60)))
     chosen = [X(10), X(20), W(0)]
+    frames = [X(int(row)) for row in found.pose]
     ordering = gtsam.Ordering()
     for key in [*chosen, *sorted({*found.values.keys()} - {*chosen})]:
         ordering.push_back(key)
@@ -204,6 +206,8 @@ def test_marginals_are_blocks_of_the_inverse_information(drive):
                         (found.marginals.joint(X(20), W(0)), np.s_[3:6, 6:9])):
         off = (part - covariance[block]) / (scale[:, None] * scale)[block]
         assert np.abs(off).max() < 1e-5
+    pairs = [found.marginals.pair(*both) for both in pairwise(frames)]
+    assert_allclose(found.marginals.neighbours(frames), pairs, rtol=1e-6, atol=1e-12)
 
 
 def test_where_cholesky_fails_qr_gives_the_same_solution_and_marginals(drive, monkeypatch):
@@ -224,6 +228,9 @@ def test_where_cholesky_fails_qr_gives_the_same_solution_and_marginals(drive, mo
     assert_allclose(found.covariances, expected.covariances, rtol=1e-6, atol=1e-9)
     joint, by_cholesky = (each.marginals.joint(X(190), W(0)) for each in (found, expected))
     assert_allclose(joint, by_cholesky, rtol=1e-6, atol=1e-6 * np.abs(by_cholesky).max())
+    keys = [X(int(row)) for row in found.pose]
+    pairs, by_cholesky = (each.marginals.neighbours(keys) for each in (found, expected))
+    assert_allclose(pairs, by_cholesky, rtol=1e-5, atol=1e-10)
 
 
 def one_range(graph, values):

@@ -12,7 +12,6 @@ between them follow from. How far the engine's solution is from GTSAM's is part 
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import gtsam
 import numpy as np
@@ -304,7 +303,7 @@ def solve_by_gtsam(fit: Fit) -> GtsamSolution:
     values = found.values
     marginals = found.marginals
     keys = [X(i) for i in problem.measurements.frame.tolist()]
-    pairs = np.reshape([marginals.pair(*both) for both in pairwise(keys)], (-1, 6, 6))
+    pairs = marginals.neighbours(keys)
     last = marginals.covariance(keys[-1])
     return GtsamSolution(
         state=state_at(fit, values), frames=np.concatenate([pairs[:, :3, :3], last[None]]),
