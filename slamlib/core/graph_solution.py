@@ -25,7 +25,7 @@ CONVERGED = 1e-6             # decrease of the error, over 1 + error, at which s
 STUCK = 1e-3                 # the same, promised by a step that brings none: steps are stuck
 ROUNDING = 1e-12             # relative increase of the error that is due to float rounding
 MAX_STEPS = 30               # number of steps of Gauss-Newton
-MAX_HALVINGS = 8             # number of halvings of one step
+MAX_HALVINGS = 8             # number of lengths of one step, each half of the last
 TOGETHER = 16                # number of poses whose joint covariance is asked for at once
 MAX_CONTRADICTION = 10.0     # sigmas, of a factor at the solution that is consistent
 
@@ -201,7 +201,7 @@ def require_values(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values):
 
 
 def gauss_newton(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values,
-                 max_steps: int = MAX_STEPS) -> GaussNewton:
+                 max_steps: int = MAX_STEPS, max_halvings: int = MAX_HALVINGS) -> GaussNewton:
     """The end of Gauss-Newton on a graph from initial values.
 
     Raises DatasetError, which names a variable, if the factors do not determine every one.
@@ -212,7 +212,7 @@ def gauss_newton(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values,
     for steps in range(1, max_steps + 1):
         linear = graph.linearize(values)
         tree, step = eliminated(linear, ordering)
-        moved, new = after_step(graph, values, step, error)
+        moved, new = after_step(graph, values, step, error, max_halvings)
         LOG.debug("Gauss-Newton step %d: error %.6g", steps, new)
         if error - new <= CONVERGED * (1 + error):
             promised = linear.error(values.zeroVectors()) - linear.error(step)
@@ -224,22 +224,22 @@ def gauss_newton(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values,
 
 
 def after_step(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, step: gtsam.VectorValues,
-               error: float) -> tuple[gtsam.Values, float]:
+               error: float, max_halvings: int) -> tuple[gtsam.Values, float]:
     """Values after a step, halved until the error of the graph does not grow, and their error."""
     def moved(fraction):
         there = FixedValues(values.retract(step.scale(fraction)))
         return there, graph.error(there)
 
-    return descended(moved, values, error)
+    return descended(moved, values, error, max_halvings)
 
 
-def descended(moved: Callable[[float], tuple], start: object,
-              error: float) -> tuple[object, float]:
+def descended(moved: Callable[[float], tuple], start: object, error: float,
+              max_halvings: int = MAX_HALVINGS) -> tuple[object, float]:
     """The point after a step, halved until the error does not grow, and its error.
 
     The function `moved` returns both for a fraction of the step from the point `start`.
     """
-    for halving in range(MAX_HALVINGS):
+    for halving in range(max_halvings):
         point, new = moved(0.5**halving)
         if new <= (1 + ROUNDING) * error:
             return point, new

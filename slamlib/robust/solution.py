@@ -3,8 +3,9 @@
 `decisions_of` states what the Fit of the deciding engine found, and `core.graph` builds the graph
 of it. Sightings are custom factors where entries of their calibration are unknown; these entries
 are the variable S(0), in standard deviations from what is stated. Those of the ranges are R(0).
-Gauss-Newton starts from problem 1's odometry. Where it does not converge from there in a few steps,
-or ends at a larger error than that of the engine's solution, it starts again from this solution.
+Gauss-Newton starts from problem 1's odometry. Where it does not converge from there in a few steps
+that are hardly shortened, or ends at a larger error than that of the engine's solution, it starts
+again from this solution.
 
 Covariances are GTSAM's marginals; those of neighbouring frames together are what encoder poses
 between them follow from. How far the engine's solution is from GTSAM's is part of the result.
@@ -46,7 +47,9 @@ from slamlib.robust.fit import Fit
 from slamlib.robust.initialization import odometry_state
 from slamlib.robust.linear import Problem, State, state_from_arrays
 
-ODOMETRY_STEPS = 8               # number of steps from odometry; on a long drive each is dear
+# Number of steps from odometry, and of halvings of each; on a long drive each one is dear.
+ODOMETRY_STEPS = 8
+ODOMETRY_HALVINGS = 3
 SAME_ERROR = 10 * CONVERGED      # relative difference of errors of one minimum
 FROM_ODOMETRY = "odometry"
 FROM_ENGINE = "the deciding engine's solution"
@@ -294,7 +297,8 @@ def solve_by_gtsam(fit: Fit) -> GtsamSolution:
     graph = graph_of(problem)
     decided = values_of(problem, fit.state, graph)
     odometry = odometry_state(problem.measurements, problem.odometry.model)
-    found = gauss_newton(graph, values_of(problem, odometry, graph), ODOMETRY_STEPS)
+    found = gauss_newton(
+        graph, values_of(problem, odometry, graph), ODOMETRY_STEPS, ODOMETRY_HALVINGS)
     start = FROM_ODOMETRY
     limit = graph.error(decided)
     if not found.converged or found.error > limit + SAME_ERROR * (1 + limit):
