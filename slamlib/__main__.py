@@ -104,10 +104,10 @@ def _build(options):
 
 def _told(summaries):
     """The exit code by the summaries of drives, after printing a table, what failed and doubts."""
-    from slamlib.solve import COLUMNS, drive_rows
-    rows = drive_rows(summaries)
-    for line in _aligned(rows, COLUMNS[:-1]):            # without the sentences on failures
-        print(line)
+    from slamlib.solve import drives_table
+    table = drives_table(summaries).drop(columns="failed")      # whose sentences are printed below
+    known = table.dropna(axis="columns", how="all")
+    print(known.to_string(index=False, na_rep="-", float_format="{:.4g}".format))
     code = 0
     for summary in summaries:
         name = summary["dataset"]
@@ -121,25 +121,6 @@ def _told(summaries):
         if "error" in summary:
             code = _ended(2, summary["error"])
     return code
-
-
-def _aligned(rows, columns):
-    """Lines of a table of rows (dicts), of the columns in which any of them has a value."""
-    shown = []
-    for name in columns:
-        values = [row.get(name) for row in rows]
-        if any(value is not None for value in values):
-            cells = [name, *map(_cell, values)]
-            width = max(map(len, cells))
-            shown.append([cell.rjust(width) for cell in cells])
-    return ["  ".join(line) for line in zip(*shown)]
-
-
-def _cell(value):
-    """A value of a table as text: four digits of a fraction, a dash for what is not known."""
-    if value is None:
-        return "-"
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def _solve(options):

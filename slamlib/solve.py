@@ -5,7 +5,6 @@ plain numbers. `solve_to_folder` does so for all problems of a dataset, `solve_f
 datasets.
 """
 
-import csv
 import multiprocessing
 import signal
 import sys
@@ -15,7 +14,6 @@ from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
-from io import StringIO
 from os.path import abspath
 from pathlib import Path
 from typing import NamedTuple
@@ -187,6 +185,8 @@ def solutions(dataset: Dataset, problems: Collection[str] = PROBLEMS) -> list[So
     listed = [problem for problem in PROBLEMS if problem in problems and allows(dataset, problem)]
     slam = [problem for problem in listed if problem in ("problem3", "problem4")]
     others = [problem for problem in listed if problem not in slam]
+    if not slam or not others:
+        return _in_turn(dataset, listed)
     wait_for_others = _meanwhile(_in_turn, dataset, others)
     found = _in_turn(dataset, slam)
     return wait_for_others() + found
@@ -194,16 +194,12 @@ def solutions(dataset: Dataset, problems: Collection[str] = PROBLEMS) -> list[So
 
 def _in_turn(dataset, problems):
     """The Solution or Failure of each of the `problems`."""
-    by_markers = dataset.without("uwb")                  # the same one for problems 1 to 3
-    previous = None
+    found = None
     every = []
     for problem in problems:
         start = time.perf_counter()
         try:
-            measured = dataset if problem == "problem4" else by_markers
-            found = find(problem, measured, previous)
-            if isinstance(found, SlamResult):
-                previous = found
+            found = find(problem, dataset, previous=found)
             solution = problem_solution(problem, dataset, found)
             solution.facts["seconds"] = time.perf_counter() - start
         except UNSOLVABLE as error:
@@ -375,15 +371,15 @@ def _write_estimated_vehicle(path, vehicle, rows):
     for entry in learned.get("calibration", ()):
         name = entry["name"]
         if entry["released"] and hasattr(vehicle, name):
-            digits = 3 - int(np.log10(entry["sigma"]))             # to a hundredth of sigma
-            estimated[name] = round(entry["estimate"], digits)
-            estimated[f"sigma_{name}"] = float(f"{entry['sigma']:.3g}")
+            estimated[name] = entry["estimate"]
+            estimated[f"sigma_{name}"] = entry["sigma"]
     for name, fact in NOISE.items():
         if fact in learned and getattr(vehicle, name) is None:
-            estimated[name] = float(f"{learned[fact]:.4g}")
+            estimated[name] = learned[fact]
     path.unlink(missing_ok=True)
     if estimated:
-        write_vehicle(path, replace(vehicle, **estimated))
+        rounded = {name: float(f"{value:.7g}") for name, value in estimated.items()}
+        write_vehicle(path, replace(vehicle, **rounded))
 
 
 def inventory_lines(dataset: Dataset, truth: Truth | None) -> list[str]:
@@ -452,19 +448,18 @@ def solve_folders(folders: Sequence[Path], out: Path | str, jobs: int | None = N
 
     summaries = Parallel(n_jobs=jobs)(
         delayed(solve)(name, folder) for name, folder in by_name.items())
-    table = StringIO()
-    writer = csv.DictWriter(table, COLUMNS, extrasaction="ignore", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(drive_rows(summaries))
-    files.write_file(out / "drives.csv", table.getvalue().encode())
+    table = drives_table(summaries).to_csv(index=False, lineterminator="\n")
+    files.write_file(out / "drives.csv", table.encode())
     return summaries
 
 
-def drive_rows(summaries: Sequence[dict]) -> list[dict]:
-    """The rows of the table over all drives: a dict for each problem, with COLUMNS among its keys.
+def drives_table(summaries: Sequence[dict]):
+    """The pandas.DataFrame of COLUMNS over all drives, a row for each problem; NaN is not known.
 
-    A problem or a drive that failed has a sentence; what is not known is absent.
+    A problem or a drive that failed has a sentence.
     """
+    import pandas as pd  # here, because it takes long to import
+
     rows = []
     for summary in summaries:
         drive = {"dataset": summary["dataset"], "failed": summary.get("error")}
@@ -472,4 +467,4 @@ def drive_rows(summaries: Sequence[dict]) -> list[dict]:
             rows.append(drive | row | {"problem": problem, "doubts": len(row["doubts"])})
         if not summary["problems"]:
             rows.append(drive)
-    return rows
+    return pd.DataFrame(rows, columns=COLUMNS, dtype=object)

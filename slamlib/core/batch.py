@@ -35,9 +35,6 @@ class Linearization:
         return all(numbers(values, key) == self.place.get(key) for key in keys)
 
 
-NOWHERE = Linearization(gtsam.Values(), {}, np.zeros((0, 0)), [])
-
-
 class Batch:
     """Custom factors of one kind, and where they were linearised last.
 
@@ -50,14 +47,14 @@ class Batch:
     def __init__(self, keys: list[list[int]], errors_at: Callable):
         self.keys = keys
         self.errors_at = errors_at
-        self.last = NOWHERE
+        self.last: Linearization | None = None
 
     def factor(self, k: int, noise: gtsam.noiseModel.Base) -> gtsam.CustomFactor:
         """The factor k with a noise model."""
         keys = [column[k] for column in self.keys]
 
         def error(factor, values, jacobians):
-            if not self.last.is_at(values, keys):
+            if self.last is None or not self.last.is_at(values, keys):
                 self.last = self.linearise(values, keys)
             if jacobians is not None:
                 for number, derivative in enumerate(self.last.derivatives):

@@ -7,6 +7,7 @@ follows Bar-Shalom, Li and Kirubarajan, *Estimation with Applications to Trackin
 (2001), section 5.4.
 """
 
+import gtsam
 import numpy as np
 
 from slamlib.core import se2
@@ -25,24 +26,18 @@ def path_length(poses: np.ndarray) -> float:
 def align(poses: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """Motion T (3,) of SE(2) for which compose(T, poses) is closest to the truth.
 
-    Least squares of the positions, Horn's problem in the plane (J. Opt. Soc. Am. A 4(4), 1987): the
-    cross and dot products of the centred positions give the rotation. Both are (n, >= 2), finite.
+    Least squares of the positions, Horn's problem in the plane (J. Opt. Soc. Am. A 4(4), 1987).
+    Both are (n, >= 2), finite, of at least two poses.
     """
-    mean = poses[:, :2].mean(axis=0)
-    true_mean = truth[:, :2].mean(axis=0)
-    p = poses[:, :2] - mean
-    q = truth[:, :2] - true_mean
-    cross = p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]
-    turn = np.arctan2(np.sum(cross), np.sum(p * q))
-    shift = true_mean - se2.rotation(turn) @ mean
-    return np.append(shift, turn)
+    T = gtsam.Pose2.Align(truth[:, :2].T, poses[:, :2].T)
+    return np.array([T.x(), T.y(), T.theta()])
 
 
 def ate(poses: np.ndarray, truth: np.ndarray, aligned: bool = False) -> float:
     """Absolute trajectory error: root mean square in m of the position errors.
 
-    Poses that are NaN are left out; the result is NaN if all are. With `aligned` the poses are
-    first aligned with the truth by one motion of SE(2).
+    Poses that are NaN are left out; the result is NaN if all are. With `aligned` the poses, if they
+    are more than one, are first aligned with the truth by one motion of SE(2).
 
     >>> poses, truth = np.array([[0, 0, 0], [3, 4, 0]]), np.zeros((2, 3))
     >>> round(ate(poses, truth), 3)
@@ -53,7 +48,7 @@ def ate(poses: np.ndarray, truth: np.ndarray, aligned: bool = False) -> float:
     truth = truth[known]
     if not len(poses):
         return np.nan
-    if aligned:
+    if aligned and len(poses) > 1:
         poses = se2.compose(align(poses, truth), poses)
     error = poses[:, :2] - truth[:, :2]
     squared = np.sum(error**2, axis=1)
@@ -89,11 +84,9 @@ def nees_band(count: int, dof: int = 3, probability: float = 0.95) -> tuple[floa
     >>> np.round(nees_band(8), 2)
     array([1.55, 4.92])
     """
-    from scipy.special import chdtri  # here, because it takes long to import
+    from scipy.stats import chi2  # here, because it takes long to import
 
-    tail = (1 - probability) / 2
-    low = chdtri(dof * count, 1 - tail)
-    high = chdtri(dof * count, tail)
+    low, high = chi2.interval(probability, dof * count)
     return low / count, high / count
 
 

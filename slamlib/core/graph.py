@@ -227,15 +227,6 @@ def initial_values(dataset: Dataset, decisions: Decisions) -> gtsam.Values:
         dataset.ticks, dataset.vehicle, model=decisions.odometry.model)
     for i in decisions.odometry.frame.tolist():
         values.insert(X(i), gtsam.Pose2(*poses[i]))
-    insert_markers(values, decisions, poses, covariances)
-    for antenna, position in guessed(decisions.guess, decisions.ranges.antenna).items():
-        values.insert(A(antenna), position)
-    return values
-
-
-def insert_markers(values: gtsam.Values, decisions: Decisions, poses: np.ndarray,
-                   covariances: np.ndarray):
-    """Insert each marker at the consensus of its sightings, seen from poses (n, 3)."""
     sightings = decisions.sightings
     i = sightings.pose
     in_world, C = se2.compose_uncertain(
@@ -246,3 +237,6 @@ def insert_markers(values: gtsam.Values, decisions: Decisions, poses: np.ndarray
             values.insert(P(marker), in_world[k, :2])
         else:
             values.insert(L(marker), gtsam.Pose2(*in_world[k]))
+    for antenna, position in guessed(decisions.guess, decisions.ranges.antenna).items():
+        values.insert(A(antenna), position)
+    return values

@@ -9,7 +9,7 @@ with factors and variables of one's own.
 import logging
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import gtsam
@@ -30,32 +30,6 @@ TOGETHER = 16                # number of poses whose joint covariance is asked f
 MAX_CONTRADICTION = 10.0     # sigmas, of a factor at the solution that is consistent
 
 LOG = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class GraphSolution:
-    """Poses and maps at the solution of a graph, covariances in world axes: m, m, rad.
-
-    A marker without heading has a NaN heading. `marginals` has the covariances of all variables,
-    those of one's own too, in GTSAM's axes.
-    """
-
-    graph: gtsam.NonlinearFactorGraph
-    values: gtsam.Values
-    marginals: "Marginals"
-    pose: np.ndarray                # (f,) rows of the encoder file, from 0, ascending
-    poses: np.ndarray               # (f, 3)
-    covariances: np.ndarray         # (f, 3, 3)
-    marker: np.ndarray              # (k,) ids, ascending
-    marker_in_world: np.ndarray     # (k, 3)
-    marker_covariance: np.ndarray   # (k, 3, 3)
-    antenna: np.ndarray             # (a,) ids, ascending
-    antenna_in_world: np.ndarray    # (a, 2)
-    antenna_covariance: np.ndarray  # (a, 2, 2)
-    steps: int                      # of Gauss-Newton
-    error: float                    # half the sum of squared whitened errors, or kernels' losses
-    converged: bool                 # whether it is a minimum, and no factor contradicts it
-    contradiction: str              # a sentence on the factor that contradicts most, or ""
 
 
 @dataclass(frozen=True)
@@ -149,7 +123,27 @@ class GaussNewton:
     error: float             # half the sum of squared whitened errors, or kernels' losses
     steps: int               # number of steps
     converged: bool          # whether the error had stopped falling, at a minimum
-    marginals: Marginals     # where the last step was linearised
+    marginals: Marginals     # of all variables in GTSAM's axes, where the last step was linearised
+
+
+@dataclass(frozen=True)
+class GraphSolution(GaussNewton):
+    """Poses and maps at the solution of a graph, covariances in world axes: m, m, rad.
+
+    A marker without heading has a NaN heading. It is `converged` if no factor contradicts it.
+    """
+
+    graph: gtsam.NonlinearFactorGraph
+    pose: np.ndarray                # (f,) rows of the encoder file, from 0, ascending
+    poses: np.ndarray               # (f, 3)
+    covariances: np.ndarray         # (f, 3, 3)
+    marker: np.ndarray              # (k,) ids, ascending
+    marker_in_world: np.ndarray     # (k, 3)
+    marker_covariance: np.ndarray   # (k, 3, 3)
+    antenna: np.ndarray             # (a,) ids, ascending
+    antenna_in_world: np.ndarray    # (a, 2)
+    antenna_covariance: np.ndarray  # (a, 2, 2)
+    contradiction: str              # a sentence on the factor that contradicts most, or ""
 
 
 def solve_graph(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> GraphSolution:
@@ -175,14 +169,13 @@ def solve_graph(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> Grap
     if not found.converged:
         LOG.warning("the error still falls after %d steps, to %.4g, or no step lowers it",
                     found.steps, found.error)
+    end = replace(found, converged=found.converged and not worst)
     return GraphSolution(
-        graph=graph, values=found.values, marginals=found.marginals,
+        **vars(end), graph=graph,
         pose=pose, poses=poses, covariances=covariances,
         marker=marker, marker_in_world=marker_in_world, marker_covariance=marker_covariance,
         antenna=antenna, antenna_in_world=antennas[:, :2],
-        antenna_covariance=antenna_covariance[:, :2, :2],
-        steps=found.steps, error=found.error, converged=found.converged and not worst,
-        contradiction=worst)
+        antenna_covariance=antenna_covariance[:, :2, :2], contradiction=worst)
 
 
 def require_values(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values):

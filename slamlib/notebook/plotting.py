@@ -211,10 +211,10 @@ def draw_antennas(ax: Axes, positions: np.ndarray, covariances: np.ndarray,
     return landmarks(ax, positions, "antenna", "antennas: estimate")
 
 
-def landmarks(ax: Axes, places: np.ndarray, role: str, label: str) -> Axes:
+def landmarks(ax: Axes, places: np.ndarray, role: str, label: str, **look) -> Axes:
     """Draw the signs of landmarks at places (k, >= 2)."""
     if len(places):
-        ax.plot(places[:, 0], places[:, 1], label=label, **ROLES[role])
+        ax.plot(places[:, 0], places[:, 1], label=label, **ROLES[role] | look)
     return ax
 
 

@@ -76,14 +76,14 @@ def _read(data, selected):
         require(DATASET_NAME.fullmatch(name), data / name, "letters from a to z, digits, spaces, "
                 "dots, dashes and underscores in its name: rename this folder")
     drives = read_drives(data, selected)
-    lines = []
     for drive in drives:
-        lines += inventory_lines(drive.dataset, drive.truth)
+        _say("\n".join(inventory_lines(drive.dataset, drive.truth)))
     omitted = set(names) - {drive.name for drive in drives}
     if omitted:
-        lines.append(f"left out, because simulated: {', '.join(sorted(omitted))} (name all "
-                     "datasets to have them)")
-    _say("\n".join(lines + unread))
+        _say(f"left out, because simulated: {', '.join(sorted(omitted))} (name all datasets to "
+             "have them)")
+    for line in unread:
+        _say(line)
     return drives
 
 

@@ -25,8 +25,8 @@ import numpy as np
 from slamlib.core import odometry, se2
 from slamlib.core.marker_increments import distance_and_turn, robust_increments
 from slamlib.core.records import Dataset
-from slamlib.core.sightings import GATE, MEDIAN_CHI2, sightings_by_frame
-from slamlib.robust.part_faults import constant_delay, slipping_rows
+from slamlib.core.sightings import GATE, sightings_by_frame
+from slamlib.robust.part_faults import constant_delay, scale_of, size_of, slipping_rows
 
 log = logging.getLogger(__name__)
 
@@ -307,13 +307,8 @@ def _cancel(drive, run):
     moved = reduce(_Drive.with_jump, run, drive)
     off = se2.between(se2.between(drive.poses[first], drive.poses[last]),
                       se2.between(moved.poses[first], moved.poses[last]))
-    least = min(_size(jump.motion) for jump in run)
-    return _size(off) < CANCELLED * least
-
-
-def _size(motion):
-    """Size of a motion (3,), m, with a radian as one metre."""
-    return np.linalg.norm(distance_and_turn(motion))
+    least = min(size_of(jump.motion) for jump in run)
+    return size_of(off) < CANCELLED * least
 
 
 def _covariance_scale(s, drive):
@@ -322,7 +317,7 @@ def _covariance_scale(s, drive):
     squared = pairs.squared[pairs.span == 1]
     if not len(squared):
         return 1.0
-    return max(1.0, np.median(squared) / MEDIAN_CHI2[3])
+    return scale_of(squared, 3)
 
 
 def _usual(drive):

@@ -138,8 +138,7 @@ def with_other_axes(dataset: Dataset, wheels: np.ndarray, poses: np.ndarray) -> 
 
     From those as stated, `wheels` (n, 3), between encoder poses (n, 2).
     """
-    path = _path(dataset, RIGHT_REVERSED)
-    one_reversed = se2.between(path[poses[:, 0]], path[poses[:, 1]])
+    one_reversed = _increments(_path(dataset, RIGHT_REVERSED), poses)
     return np.concatenate([wheels @ MOTIONS, one_reversed @ MOTIONS[:4]])
 
 
@@ -159,8 +158,7 @@ def with_wheels_mended(dataset: Dataset) -> Dataset:
 
     def cost(changed):
         """What still contradicts the markers."""
-        path = _path(changed)
-        by_wheels = se2.between(path[poses[:, 0]], path[poses[:, 1]])
+        by_wheels = _increments(_path(changed), poses)
         return _limited(contradictions(markers, by_wheels, sigma)).sum()
 
     first = stretch.first
@@ -181,9 +179,9 @@ def contradictions(markers: np.ndarray, wheels: np.ndarray, sigma: np.ndarray) -
 
     `sigma` (n, 2) is that of distance and turn by markers.
     """
-    size = np.maximum(_size(markers), _size(wheels))
+    size = np.maximum(size_of(markers), size_of(wheels))
     tolerance = AGREEMENT_RATIO * size + AGREEMENT_SIGMAS * np.linalg.norm(sigma, axis=1)
-    return _size(markers - wheels) / tolerance
+    return size_of(markers - wheels) / tolerance
 
 
 def _limited(off):
@@ -191,7 +189,7 @@ def _limited(off):
     return np.where(off < 1, off, 1.0)
 
 
-def _size(increment):
+def size_of(increment: np.ndarray) -> np.ndarray:
     """Root of the squares of distance in m and turn in rad, (...), of increments (..., 3)."""
     return np.linalg.norm(distance_and_turn(increment), axis=-1)
 
@@ -302,7 +300,7 @@ def camera_bump(dataset: Dataset) -> CameraBump | None:
     if gain < MIN_BUMP_GAIN or np.abs(motion).max() > MAX_BUMP:
         return None
     s = sightings_by_frame(dataset.sightings)
-    path = odometry.dead_reckoning(dataset.ticks, dataset.vehicle, model="arc")[s.frame]
+    path = _path(dataset)[s.frame]
     steps = se2.between(path[:-1], path[1:])
     common = np.array(common_sightings(s.row, s.marker))
     window = np.searchsorted(s.frame, [poses[k - 1, 0], poses[k, 1]])
@@ -326,13 +324,13 @@ def constant_delay(dataset: Dataset) -> int:
     markers, wheels, sigma, poses = moving_increments(dataset)
     if not len(wheels):
         return 0
-    path = odometry.dead_reckoning(dataset.ticks, dataset.vehicle, model="arc")
+    path = _path(dataset)
     cost = {}
     for steps in DELAYS:
-        late = _late_increments(path, poses, steps)
+        late = _increments(path, poses, steps)
         cost[steps] = _cost(markers, late, sigma, _by_camera(late))
     best = min(cost, key=cost.get)
-    late = _late_increments(path, poses, best)
+    late = _increments(path, poses, best)
     if cost[best] > MAX_DELAY_COST * cost[0] or not _agree_mostly(markers, late, sigma):
         return 0
     log.info("sightings: %d steps later than stated", best)
@@ -345,12 +343,12 @@ def _agree_mostly(markers, wheels, sigma):
     return len(agree) > 2 * MIN_COUNT and 2 * agree.sum() > len(agree)
 
 
-def _late_increments(path, poses, steps):
-    """Increments (n, 3) by wheels, of encoder poses (n, 2) that are too large by `steps`.
+def _increments(path, poses, late=0):
+    """Increments (n, 3) by wheels, of encoder poses (n, 2) that are too large by `late` steps.
 
-    `path` is that of all poses by wheels, `steps` a number or (n, 2).
+    `path` is that of all poses by wheels.
     """
-    taken = np.clip(poses - steps, 0, len(path) - 1)
+    taken = np.clip(poses - late, 0, len(path) - 1)
     return se2.between(path[taken[:, 0]], path[taken[:, 1]])
 
 
@@ -396,7 +394,7 @@ def _change(markers, wheels, sigma, by_change):
         k = MIN_COUNT + int(gain[MIN_COUNT:-MIN_COUNT].argmax())
         changed = np.where((np.arange(len(e)) <= k)[:, None, None], before[k], after[k])
         squared = np.sum((left - by_change @ changed)**2, axis=(1, 2)) / variance
-        weight = _robust_weights(squared, _scale(squared, 2)) / variance
+        weight = _robust_weights(squared, scale_of(squared, 2)) / variance
     return k + 1, before[k, :, 0], after[k, :, 0], gain[k] / OVERLAP
 
 
@@ -412,11 +410,11 @@ def _in_common(e, J, variance, sigma=BUMP_SIGMA):
         robust = kept[:, None, None] * weighted
         common, _ = _least_squares(np.sum(robust @ J, axis=0), np.sum(robust @ e, axis=0), sigma)
         squared = np.sum((e - J @ common)[:, :, 0]**2 / variance, axis=1)
-        kept = _robust_weights(squared, _scale(squared, e.shape[1]))
+        kept = _robust_weights(squared, scale_of(squared, e.shape[1]))
     return common, squared
 
 
-def _scale(squared, size):
+def scale_of(squared: np.ndarray, size: int) -> float:
     """Factor, 1 or more, on variances of errors of `size` components, by their squares (n,)."""
     return max(1.0, np.median(squared) / MEDIAN_CHI2[size])
 
@@ -462,7 +460,7 @@ def _other_radii(e, J, variance):
     """
     e = e[:, :, None]
     common, squared = _in_common(e, J, variance, WHEELS_SIGMA)
-    scale = _scale(squared, 3)
+    scale = scale_of(squared, 3)
     if scale > MAX_SCALE:
         return None
     kept = _robust_weights(squared, scale)

@@ -107,8 +107,8 @@ def simulate(path: str = "short", seed: int = 0, *, slip: float = 1e-3, late_ran
     if not markers:
         aruco = None
     dataset = Dataset(path, vehicle, whole_counts if noise else counts, aruco, uwb, guess)
-    count = poses or len(true_poses)
-    return dataset.first(count), replace(truth, poses=true_poses[:count])
+    truth = replace(truth, poses=true_poses[:poses])
+    return dataset.first(len(truth.poses)), truth
 
 
 def misguess(dataset: Dataset, position: np.ndarray, error: float, seed: int) -> Dataset:
@@ -230,8 +230,7 @@ def _counts(ds, dtheta, vehicle):
 def _encoder(counts, vehicle, slip, rng):
     """Whole counts (n, 2) of an encoder on wheels that slip, of counts with fractions."""
     steps = counts[1:]
-    count_length = 2 * np.pi * vehicle.wheel[:2] / vehicle.ticks_per_revolution     # m
-    sigma = slip * np.sqrt(np.abs(steps) / count_length)                        # of the counts
+    sigma = slip * np.sqrt(np.abs(steps) / vehicle.metres_per_count)            # of the counts
     slipped = steps + sigma * rng.standard_normal(steps.shape)
     first_fraction = rng.uniform(size=2)
     total = np.floor(np.cumsum(slipped, axis=0) + first_fraction).astype(np.int64)
