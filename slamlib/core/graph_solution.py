@@ -10,7 +10,7 @@ import logging
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import chain, pairwise
 
 import gtsam
 import numpy as np
@@ -26,7 +26,7 @@ STUCK = 1e-3                 # the same, promised by a step that brings none: st
 ROUNDING = 1e-12             # relative increase of the error that is due to float rounding
 MAX_STEPS = 30               # number of steps of Gauss-Newton
 MAX_HALVINGS = 8             # number of lengths of one step, each half of the last
-TOGETHER = 16                # number of poses whose joint covariance is asked for at once
+TOGETHER = 64                # number of variables whose joint covariance is asked for at once
 MAX_CONTRADICTION = 10.0     # sigmas, of a factor at the solution that is consistent
 
 LOG = logging.getLogger(__name__)
@@ -71,27 +71,37 @@ class Marginals:
         return determined(covariance, first)
 
     def neighbours(self, keys: list[int]) -> np.ndarray:
-        """The covariances (f - 1, 6, 6) of each of f poses with the next one.
-
-        GTSAM is asked for TOGETHER poses at once, which takes half the time of one pair after the
-        other: the path from them to the root of the tree is walked once.
-        """
+        """The covariances (n - 1, 6, 6) of each of n poses and the next one."""
         covariances = []
         for start in range(0, len(keys) - 1, TOGETHER - 1):
-            some = keys[start:start + TOGETHER]
-            try:
-                joint = self.tree.jointMarginalCovariance(some).fullMatrix()
-            except RuntimeError:
-                covariances.extend(self.pair(*both) for both in pairwise(some))
-                continue
-            rows = range(0, len(joint) - 3, 3)
-            covariances.extend(joint[row:row + 6, row:row + 6] for row in rows)
-        return determined(np.reshape(covariances, (-1, 6, 6)), keys[0])
+            covariances += self._of_groups(list(pairwise(keys[start:start + TOGETHER])))
+        return np.reshape(covariances, (-1, 6, 6))
+
+    def covariances(self, keys: list[int]) -> list[np.ndarray]:
+        """The covariance (d, d) of each variable."""
+        covariances = []
+        for start in range(0, len(keys), TOGETHER):
+            covariances += self._of_groups([[key] for key in keys[start:start + TOGETHER]])
+        return covariances
+
+    def _of_groups(self, groups):
+        """The covariance of each group of one or two variables, from that of all of them.
+
+        GTSAM walks the tree from them to the root once, in place of once for each group.
+        """
+        keys = list(dict.fromkeys(chain(*groups)))
+        try:
+            joint = self.tree.jointMarginalCovariance(keys)
+        except RuntimeError:
+            return [self.pair(*group) if len(group) == 2 else self.covariance(*group)
+                    for group in groups]
+        return [determined(np.block([[joint.at(row, column) for column in group] for row in group]),
+                           group[0]) for group in groups]
 
 
 def determined(covariance: np.ndarray, near: int) -> np.ndarray:
     """The covariance, unless rounding alone determines a variable: then raises DatasetError."""
-    if covariance.max(initial=0.0) > MAX_VARIANCE:
+    if covariance.max() > MAX_VARIANCE:
         raise undetermined(gtsam.DefaultKeyFormatter(near))
     return covariance
 

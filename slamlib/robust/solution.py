@@ -322,10 +322,9 @@ def landmark_covariances(problem: Problem, values: gtsam.Values,
     """Covariances (k + a, 3, 3) of landmarks, zero of markers without accepted sightings."""
     keys = variable_keys(problem)[len(problem.measurements.frame):]
     blocks = np.zeros((len(keys), 3, 3))
-    for k, key in enumerate(keys):
-        if values.exists(key):
-            C = marginals.covariance(key)
-            blocks[k, :len(C), :len(C)] = C
+    there = [k for k, key in enumerate(keys) if values.exists(key)]
+    for k, C in zip(there, marginals.covariances([keys[k] for k in there])):
+        blocks[k, :len(C), :len(C)] = C
     return blocks
 
 
