@@ -234,7 +234,7 @@ def _two_of_each(pair, chosen):
 def _increment_of_two_points(p1, q1, p2, q2):
     """Delta from the positions (n, 2) of two markers: direction p to q and midpoint coincide."""
     turn = _direction(q1 - p1) - _direction(q2 - p2)
-    turned = np.einsum("nij,nj->ni", se2.rotation(turn), (p2 + q2) / 2)
+    turned = np.matvec(se2.rotation(turn), (p2 + q2) / 2)
     return np.column_stack([(p1 + q1) / 2 - turned, turn])
 
 

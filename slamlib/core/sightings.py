@@ -98,7 +98,7 @@ def _mean(z, C):
     information = np.linalg.inv(C)
     r = se2.difference(z, z[0])
     covariance = np.linalg.inv(information.sum(0))
-    mean = covariance @ np.einsum("nij,nj->i", information, r)
+    mean = covariance @ np.matvec(information, r).sum(0)
     squared = np.einsum("ni,nij,nj->n", r - mean, information, r - mean)
     return z[0] + mean, covariance, np.all(squared < GATE)
 

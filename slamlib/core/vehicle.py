@@ -155,10 +155,10 @@ def changed(vehicle: Vehicle, entries: dict, source: Path | str | None) -> Vehic
         if isinstance(limit, Limit):
             is_number = isinstance(value, Real) and not isinstance(value, bool)
             require(is_number and limit.holds(value), source, f"a number {limit} for {key}", value)
-            stated[key] = float(value)
+            value = float(value)
         else:
             is_listed = type(value) is type(limit[0]) and value in limit
             listed = " or ".join(map(json.dumps, limit))
             require(is_listed, source, f"{listed} for {key}", value)
-            stated[key] = value
+        stated[key] = value
     return replace(vehicle, **stated)

@@ -83,10 +83,10 @@ def _over_drives(values):
 
 def true_places(drive, kind: str, ids: np.ndarray) -> np.ndarray:
     """True places (k, c) of landmarks (k,) of a `kind`, NaN where a Drive does not know them."""
-    if drive.truth is None:
+    truth = drive.truth
+    if truth is None:
         return np.full((len(ids), 2), np.nan)
-    places = getattr(drive.truth, f"{kind}_in_world")
-    return places_by_id(getattr(drive.truth, kind), places, ids)
+    return places_by_id(getattr(truth, kind), getattr(truth, f"{kind}_in_world"), ids)
 
 
 def accuracy(result, drive) -> dict:

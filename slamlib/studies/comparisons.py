@@ -78,8 +78,7 @@ def by_marker(choose: Callable) -> Callable:
     """
     def start(measurements, in_world, covariances):
         every = [measurements.marker_row == j for j in range(len(measurements.marker))]
-        places = [choose(in_world[own], covariances[own]) for own in every]
-        return np.array(places).reshape(-1, 3)
+        return np.array([choose(in_world[own], covariances[own]) for own in every])
 
     return start
 

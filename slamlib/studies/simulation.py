@@ -222,9 +222,9 @@ def _driven_arcs(layout):
 def _counts(ds, dtheta, vehicle):
     """Counts (n, 2), right and left, with fractions, on arcs of length ds and turn dtheta."""
     half_turn = vehicle.wheelbase * dtheta / 2
-    steps = np.stack([ds + half_turn, ds - half_turn], axis=-1)
+    steps = np.column_stack([ds + half_turn, ds - half_turn])
     travel = np.pad(steps, ((1, 0), (0, 0)))
-    return travel * vehicle.ticks_per_revolution / (2 * np.pi * vehicle.wheel[:2])
+    return travel / vehicle.metres_per_count
 
 
 def _encoder(counts, vehicle, slip, rng):
@@ -281,8 +281,7 @@ def _camera(truth, every, mislabelled, memory, noise, rng):
     frame = np.repeat(np.arange(len(frames)), [len(markers) for markers in seen])
     marker = np.concatenate(seen).astype(int)
     true_z = se2.between(truth.poses[frames[frame]], truth.marker_in_world[marker])
-    distance = np.hypot(true_z[:, 0], true_z[:, 1])
-    covariance = _sighting_covariance(true_z, distance)
+    covariance = _sighting_covariance(true_z)
     unit_error = _correlated(rng.standard_normal(true_z.shape), frame, marker, memory)
     error = np.linalg.cholesky(covariance) @ unit_error[..., None]
     z = true_z + noise * error[..., 0]
@@ -291,8 +290,9 @@ def _camera(truth, every, mislabelled, memory, noise, rng):
     return ArucoReadings(frames[frame], truth.marker[read_as], z, covariance)
 
 
-def _sighting_covariance(z, distance):
+def _sighting_covariance(z):
     """Covariances (m, 3, 3) of sightings z (m, 3), which err most along the line of sight."""
+    distance = np.hypot(z[:, 0], z[:, 1])
     correlation = [[1, 0, 0], [0, 1, 0.4], [0, 0.4, 1]]
     sigma = [4e-3, 3e-3, 4e-3] + distance[:, None] * [5e-3, 3e-3, 3e-3]
     along_sight = sigma[:, :, None] * correlation * sigma[:, None]
@@ -342,5 +342,5 @@ def distances(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def _direction(angle):
-    """Unit vectors (..., 2) at angles (...) in rad."""
-    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    """Unit vectors (n, 2) at angles (n,) in rad."""
+    return np.column_stack([np.cos(angle), np.sin(angle)])
