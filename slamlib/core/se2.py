@@ -11,12 +11,7 @@ broadcasts over the leading dimensions. Jacobians are partial derivatives by the
 Headings are added and subtracted but not wrapped; call `wrap` where an angle must lie in (-pi, pi].
 With B(h), which rotates x and y by h and leaves the heading,
 
-    T_ac = T_ab + B(h_ab) T_bc,        T_ab = B(-h_wa) (T_wb - T_wa),
-
-and with A([x, y, h]), the identity but for the derivatives -y and x of x and y by a rotation,
-
-    dT_ac/dT_ab = A(B(h_ab) T_bc),     dT_ac/dT_bc = B(h_ab),
-    dT_ab/dT_wa = -A(T_ab) B(-h_wa),   dT_ab/dT_wb = B(-h_wa).
+    T_ac = T_ab + B(h_ab) T_bc,        T_ab = B(-h_wa) (T_wb - T_wa).
 """
 
 import numpy as np
@@ -52,7 +47,7 @@ def compose(T_ab: np.ndarray, T_bc: np.ndarray) -> np.ndarray:
     array([1.   , 2.   , 1.571])
     """
     T_ab = np.asarray(T_ab, dtype=float)
-    return T_ab + np.matvec(_turning(T_ab[..., 2]), T_bc)
+    return T_ab + _turned(T_bc, T_ab[..., 2])
 
 
 def inverse(T_ab: np.ndarray) -> np.ndarray:
@@ -67,7 +62,7 @@ def between(T_wa: np.ndarray, T_wb: np.ndarray) -> np.ndarray:
     array([2., 0., 0.])
     """
     T_wa = np.asarray(T_wa, dtype=float)
-    return np.matvec(_turning(-T_wa[..., 2]), T_wb - T_wa)
+    return _turned(T_wb - T_wa, -T_wa[..., 2])
 
 
 def difference(first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -80,9 +75,13 @@ def difference(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 def compose_with_jacobians(T_ab: np.ndarray, T_bc: np.ndarray) -> tuple[np.ndarray, ...]:
     """T_ac = T_ab T_bc, (..., 3), and its derivatives by T_ab and T_bc, each (..., 3, 3)."""
     T_ab = np.asarray(T_ab, dtype=float)
-    by_second = _turning(T_ab[..., 2])
-    lever = np.matvec(by_second, T_bc)                   # position of c from b, in axes of a
-    return T_ab + lever, _lever_arm(lever), by_second
+    lever = _turned(T_bc, T_ab[..., 2])                  # position of c from b, in axes of a
+    by_first = _identity(lever.shape)
+    by_first[..., 0, 2] = -lever[..., 1]
+    by_first[..., 1, 2] = lever[..., 0]
+    by_second = _identity(lever.shape)
+    by_second[..., :2, :2] = rotation(T_ab[..., 2])
+    return T_ab + lever, by_first, by_second
 
 
 def compose_jacobians(T_ab: np.ndarray, T_bc: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -104,10 +103,13 @@ def compose_uncertain(T_ab: np.ndarray, C_ab: np.ndarray, T_bc: np.ndarray,
 
 def between_with_jacobians(T_wa: np.ndarray, T_wb: np.ndarray) -> tuple[np.ndarray, ...]:
     """T_ab = inverse(T_wa) T_wb, (..., 3), and its derivatives by T_wa and T_wb, (..., 3, 3)."""
-    T_wa = np.asarray(T_wa, dtype=float)
-    by_second = _turning(-T_wa[..., 2])
-    T_ab = np.matvec(by_second, T_wb - T_wa)
-    return T_ab, -_lever_arm(T_ab) @ by_second, by_second
+    T_ab = between(T_wa, T_wb)
+    by_second = _identity(T_ab.shape)
+    by_second[..., :2, :2] = rotation(-np.asarray(T_wa)[..., 2])
+    by_first = -by_second
+    by_first[..., 0, 2] = T_ab[..., 1]
+    by_first[..., 1, 2] = -T_ab[..., 0]
+    return T_ab, by_first, by_second
 
 
 def between_jacobians(T_wa: np.ndarray, T_wb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -142,15 +144,16 @@ def log_with_jacobian(T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     jacobian[..., 1, 0] = -h / 2
     jacobian[..., 1, 1] = a
     jacobian[..., 1, 2] = a_by_h * y - x / 2
-    return np.stack([a * x + h * y / 2, a * y - h * x / 2, h], axis=-1), jacobian
+    return _poses(a * x + h * y / 2, a * y - h * x / 2, h), jacobian
 
 
 def rotate_covariance(covariance: np.ndarray, heading: np.ndarray) -> np.ndarray:
     """B C B^T, covariances C (..., 3, 3) of [x, y, heading] rotated from axes of b to those of a.
 
-    B is that of `heading` (...), that of b in a, in rad.
+    B rotates x and y by `heading` (...), that of b in a, in rad.
     """
-    B = _turning(heading)
+    B = _identity(np.shape(heading) + (3,))
+    B[..., :2, :2] = rotation(heading)
     return B @ covariance @ B.mT
 
 
@@ -188,19 +191,25 @@ def squared_norms(r: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     return np.sum(r * weighted, axis=-1)
 
 
-def _lever_arm(T):
-    """A(T), (..., 3, 3), of poses T (..., 3)."""
-    A = _identity(T.shape)
-    A[..., 0, 2] = -T[..., 1]
-    A[..., 1, 2] = T[..., 0]
-    return A
+def _turned(T, heading):
+    """B(heading) T, poses T (..., 3) with positions rotated by headings (...)."""
+    T = np.asarray(T)
+    x = T[..., 0]
+    y = T[..., 1]
+    c = np.cos(heading)
+    s = np.sin(heading)
+    turned_x = c * x - s * y
+    turned_y = s * x + c * y
+    return _poses(turned_x, turned_y, T[..., 2])
 
 
-def _turning(heading):
-    """B(heading), (..., 3, 3), of headings (...)."""
-    B = _identity(np.shape(heading) + (3,))
-    B[..., :2, :2] = rotation(heading)
-    return B
+def _poses(x, y, heading):
+    """Poses (..., 3), filled in place because np.stack is several times slower on small arrays."""
+    T = np.empty(np.shape(x) + (3,))
+    T[..., 0] = x
+    T[..., 1] = y
+    T[..., 2] = heading
+    return T
 
 
 def _identity(shape):
