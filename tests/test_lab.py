@@ -19,6 +19,7 @@ def test_what_is_in_jupyterlab_only_runs_and_other_values_of_the_sliders_draw_an
     monkeypatch.setenv("SLAMLIB_DATA", str(tmp_path / "data"))
     book = nbformat.read(tmp_path / "notebooks" / "1_odometry.ipynb", as_version=4)
     book.cells += [new_code_cell(f"explored({right}, 0.0, 0.0)") for right in (0.0, 0.2)]
-    NotebookClient(book, resources={"metadata": {"path": tmp_path / "notebooks"}}).execute()
+    place = {"metadata": {"path": tmp_path / "notebooks"}}
+    NotebookClient(book, resources=place, timeout=300).execute()      # seconds, for each cell
     first, second = (cell.outputs[0].data["image/svg+xml"] for cell in book.cells[-2:])
     assert first != second
