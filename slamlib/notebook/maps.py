@@ -59,7 +59,10 @@ def whole_map(drive, result, legend: bool = True) -> Figure:
         guess = plotting.places_by_id(guess.antenna, guess.position, result.antenna)
         in_doubt = np.isin(result.antenna, list(result.doubts))
         sure = np.where(in_doubt[:, None, None], 0, result.antenna_covariance)
-        plotting.draw_antennas(ax, result.antenna_in_world, sure, guess, enlarged)
+        x, y = np.stack([guess, result.antenna_in_world], axis=1).T
+        ax.plot(x, y, color="#999999", linewidth=0.8, zorder=2)
+        plotting.landmarks(ax, guess, "guess", "antennas: guess")
+        plotting.draw_antennas(ax, result.antenna_in_world, sure, enlarged)
     if legend:
         fig.set_figheight(fig.get_figheight() + LEGEND)
         plotting.legend_below(fig)

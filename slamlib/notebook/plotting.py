@@ -201,13 +201,9 @@ def ellipses(ax: Axes, positions: np.ndarray, covariances: np.ndarray, color: st
 
 
 def draw_antennas(ax: Axes, positions: np.ndarray, covariances: np.ndarray,
-                  guess: np.ndarray | None = None, enlarged: float = 1) -> Axes:
-    """Draw antennas (a, 2) with 95 % ellipses, and lines from their guesses (a, 2)."""
+                  enlarged: float) -> Axes:
+    """Draw antennas (a, 2) with 95 % ellipses, which are `enlarged` as those of `ellipses`."""
     ellipses(ax, positions, covariances, "#44AA99", enlarged=enlarged)
-    if guess is not None:
-        ax.plot([guess[:, 0], positions[:, 0]], [guess[:, 1], positions[:, 1]], color="#999999",
-                linewidth=0.8, zorder=2)
-        landmarks(ax, guess, "guess", "antennas: guess")
     return landmarks(ax, positions, "antenna", "antennas: estimate")
 
 
