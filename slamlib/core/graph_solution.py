@@ -36,8 +36,9 @@ LOG = logging.getLogger(__name__)
 class Marginals:
     """Covariances of variables by the Bayes tree of a linear graph, in GTSAM's axes.
 
-    By QR decomposition, for two variables by Cholesky's where it does not fail: it takes half the
-    time. Raises DatasetError where the factors do not determine a variable.
+    Those of several variables by Cholesky's decomposition, which takes half the time of QR
+    decomposition; by this for one variable, and where Cholesky's fails. Raises DatasetError where
+    the factors do not determine a variable.
     """
 
     tree: gtsam.GaussianBayesTree

@@ -47,7 +47,7 @@ from slamlib.robust.fit import Fit
 from slamlib.robust.initialization import odometry_state
 from slamlib.robust.linear import Problem, State, state_from_arrays
 
-# Number of steps from odometry, and of halvings of each; on a long drive each one is dear.
+# Number of steps from odometry, and of lengths of each; on a long drive each one is dear.
 ODOMETRY_STEPS = 8
 ODOMETRY_HALVINGS = 3
 SAME_ERROR = 10 * CONVERGED      # relative difference of errors of one minimum
