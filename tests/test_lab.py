@@ -1,5 +1,7 @@
 """The cells that only JupyterLab shows."""
 
+import asyncio
+
 import nbformat
 import pytest
 from conftest import copied
@@ -20,6 +22,7 @@ def test_what_is_in_jupyterlab_only_runs_and_other_values_of_the_sliders_draw_an
     book = nbformat.read(tmp_path / "notebooks" / "1_odometry.ipynb", as_version=4)
     book.cells += [new_code_cell(f"explored({right}, 0.0, 0.0)") for right in (0.0, 0.2)]
     place = {"metadata": {"path": tmp_path / "notebooks"}}
-    NotebookClient(book, resources=place, timeout=300).execute()      # seconds, for each cell
+    # A reply whose arrival is missed is looked for again after this many seconds.
+    asyncio.run(NotebookClient(book, resources=place, timeout=60).async_execute())
     first, second = (cell.outputs[0].data["image/svg+xml"] for cell in book.cells[-2:])
     assert first != second
