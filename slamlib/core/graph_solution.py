@@ -25,7 +25,7 @@ CONVERGED = 1e-6             # decrease of the error, over 1 + error, at which s
 STUCK = 1e-3                 # the same, promised by a step that brings none: steps are stuck
 ROUNDING = 1e-12             # relative increase of the error that is due to float rounding
 MAX_STEPS = 30               # number of steps of Gauss-Newton
-MAX_HALVINGS = 8             # number of lengths of one step, each half of the last
+MAX_LENGTHS = 8              # number of lengths of one step, each half of the last
 TOGETHER = 64                # number of variables whose joint covariance is asked for at once
 MAX_CONTRADICTION = 10.0     # sigmas, of a factor at the solution that is consistent
 
@@ -36,9 +36,9 @@ LOG = logging.getLogger(__name__)
 class Marginals:
     """Covariances of variables by the Bayes tree of a linear graph, in GTSAM's axes.
 
-    Those of several variables by Cholesky's decomposition, which takes half the time of QR
-    decomposition; by this for one variable, and where Cholesky's fails. Raises DatasetError where
-    the factors do not determine a variable.
+    Those of several variables at once by Cholesky's decomposition, which is faster; by QR
+    decomposition for one, and where Cholesky's fails. Raises DatasetError where the factors do not
+    determine a variable.
     """
 
     tree: gtsam.GaussianBayesTree
@@ -55,17 +55,7 @@ class Marginals:
 
     def pair(self, first: int, second: int) -> np.ndarray:
         """The covariance (d + e, d + e) of two variables."""
-        keys = [first, second]
-        try:
-            joint = self.tree.jointMarginalCovariance(keys)
-        except RuntimeError:
-            ordering = gtsam.Ordering()
-            ordering.push_back(first)
-            ordering.push_back(second)
-            root, _ = self.tree.joint(first, second, gtsam.EliminateQR).jacobian(ordering)
-            return covariance_of_root(np.linalg.qr(root, mode="r"), first)
-        blocks = [[joint.at(row, column) for column in keys] for row in keys]
-        return determined(np.block(blocks), first)
+        return self._of_groups([[first, second]])[0]
 
     def neighbours(self, keys: list[int]) -> np.ndarray:
         """The covariances (n - 1, 6, 6) of each of n poses and the next one."""
@@ -90,10 +80,22 @@ class Marginals:
         try:
             joint = self.tree.jointMarginalCovariance(keys)
         except RuntimeError:
-            return [self.pair(*group) if len(group) == 2 else self.covariance(*group)
-                    for group in groups]
-        return [determined(np.block([[joint.at(row, column) for column in group] for row in group]),
-                           group[0]) for group in groups]
+            return [self._by_qr(*group) for group in groups]
+        covariances = []
+        for group in groups:
+            blocks = [[joint.at(row, column) for column in group] for row in group]
+            covariances.append(determined(np.block(blocks), group[0]))
+        return covariances
+
+    def _by_qr(self, first, second=None):
+        """The covariance of one or two variables."""
+        if second is None:
+            return self.covariance(first)
+        ordering = gtsam.Ordering()
+        ordering.push_back(first)
+        ordering.push_back(second)
+        root, _ = self.tree.joint(first, second, gtsam.EliminateQR).jacobian(ordering)
+        return covariance_of_root(np.linalg.qr(root, mode="r"), first)
 
 
 def determined(covariance: np.ndarray, near: int) -> np.ndarray:
@@ -201,10 +203,11 @@ def require_values(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values):
 
 
 def gauss_newton(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values,
-                 max_steps: int = MAX_STEPS, max_halvings: int = MAX_HALVINGS) -> GaussNewton:
+                 max_steps: int = MAX_STEPS, max_lengths: int = MAX_LENGTHS) -> GaussNewton:
     """The end of Gauss-Newton on a graph from initial values.
 
-    Raises DatasetError, which names a variable, if the factors do not determine every one.
+    At most `max_lengths` of each step are tried, each half of the last. Raises DatasetError, which
+    names a variable, if the factors do not determine every one.
     """
     values = FixedValues(values)
     error = graph.error(values)
@@ -212,7 +215,7 @@ def gauss_newton(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values,
     for steps in range(1, max_steps + 1):
         linear = graph.linearize(values)
         tree, step = eliminated(linear, ordering)
-        moved, new = after_step(graph, values, step, error, max_halvings)
+        moved, new = after_step(graph, values, step, error, max_lengths)
         LOG.debug("Gauss-Newton step %d: error %.6g", steps, new)
         if error - new <= CONVERGED * (1 + error):
             promised = linear.error(values.zeroVectors()) - linear.error(step)
@@ -224,22 +227,22 @@ def gauss_newton(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values,
 
 
 def after_step(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, step: gtsam.VectorValues,
-               error: float, max_halvings: int) -> tuple[gtsam.Values, float]:
+               error: float, max_lengths: int) -> tuple[gtsam.Values, float]:
     """Values after a step, halved until the error of the graph does not grow, and their error."""
     def moved(fraction):
         there = FixedValues(values.retract(step.scale(fraction)))
         return there, graph.error(there)
 
-    return descended(moved, values, error, max_halvings)
+    return descended(moved, values, error, max_lengths)
 
 
 def descended(moved: Callable[[float], tuple], start: object, error: float,
-              max_halvings: int = MAX_HALVINGS) -> tuple[object, float]:
+              max_lengths: int = MAX_LENGTHS) -> tuple[object, float]:
     """The point after a step, halved until the error does not grow, and its error.
 
     The function `moved` returns both for a fraction of the step from the point `start`.
     """
-    for halving in range(max_halvings):
+    for halving in range(max_lengths):
         point, new = moved(0.5**halving)
         if new <= (1 + ROUNDING) * error:
             return point, new

@@ -12,7 +12,7 @@ import numpy as np
 
 from slamlib.core.graph_solution import (
     CONVERGED,
-    MAX_HALVINGS,
+    MAX_LENGTHS,
     ROUNDING,
     descended,
     undetermined,
@@ -61,7 +61,7 @@ def after_step(equations: NormalEquations, step: np.ndarray,
     `halvings` come first: a step is often as long as the one before.
     """
     problem = equations.problem
-    for number in range(halvings, halvings + MAX_HALVINGS):
+    for number in range(halvings, halvings + MAX_LENGTHS):
         there = NormalEquations(problem, retract(problem, equations.state, 0.5**number * step))
         if there.error <= (1 + ROUNDING) * equations.error:
             return there, number

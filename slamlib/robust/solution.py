@@ -49,7 +49,7 @@ from slamlib.robust.linear import Problem, State, state_from_arrays
 
 # Number of steps from odometry, and of lengths of each; on a long drive each one is dear.
 ODOMETRY_STEPS = 8
-ODOMETRY_HALVINGS = 3
+ODOMETRY_LENGTHS = 3
 SAME_ERROR = 10 * CONVERGED      # relative difference of errors of one minimum
 FROM_ODOMETRY = "odometry"
 FROM_ENGINE = "the deciding engine's solution"
@@ -298,7 +298,7 @@ def solve_by_gtsam(fit: Fit) -> GtsamSolution:
     decided = values_of(problem, fit.state, graph)
     odometry = odometry_state(problem.measurements, problem.odometry.model)
     found = gauss_newton(
-        graph, values_of(problem, odometry, graph), ODOMETRY_STEPS, ODOMETRY_HALVINGS)
+        graph, values_of(problem, odometry, graph), ODOMETRY_STEPS, ODOMETRY_LENGTHS)
     start = FROM_ODOMETRY
     limit = graph.error(decided)
     if not found.converged or found.error > limit + SAME_ERROR * (1 + limit):
