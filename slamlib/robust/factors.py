@@ -13,7 +13,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from slamlib.core import odometry, se2
+from slamlib.core import se2
 from slamlib.core.increments import OdometryIncrements, odometry_error, preintegrate
 from slamlib.robust.calibration import (
     ANTENNAS,
@@ -34,7 +34,7 @@ from slamlib.robust.jumps import creep_covariance
 from slamlib.robust.measurements import Measurements, square_root_information
 
 MIN_DISTANCE = 1e-9          # m, below which a range has no direction
-SMOOTHED_STEPS = 11          # encoder steps over which velocities are averaged
+SMOOTHED_STEPS = 5           # encoder steps before and after, over which a velocity is averaged
 
 
 def preintegrate_odometry(measurements: Measurements, model: str,
@@ -265,20 +265,21 @@ def delayed(measurements: Measurements, row: np.ndarray, lag: float,
             is_known: bool = True) -> tuple[np.ndarray, np.ndarray]:
     """Where the vehicle was `lag` encoder steps before the frames `row` (m,), in the axes there.
 
-    Also its velocities (m, 3) per step at that time, in m and rad, by a smooth path: the noise of
-    single steps would bias the delay. Both are 0 (3,) where there is no lag and it `is_known`.
+    Also its velocities (m, 3) per step at that time, in m and rad, averaged, because the noise of
+    single steps would bias the delay. By them the vehicle moves for a part of a step: between two
+    rows the rounding of the counts averages out, which would look like a delay of half a step. Both
+    are 0 (3,) where there is no lag and it `is_known`.
     """
     if is_known and lag == 0:
         return np.zeros(3), np.zeros(3)
     path = measurements.path
     frame = measurements.frame[row]
-    half = SMOOTHED_STEPS // 2
-    total = odometry.cumulative(np.pad(path, ((half, half), (0, 0)), "edge"))
-    smooth = (total[SMOOTHED_STEPS:] - total[:-SMOOTHED_STEPS]) / SMOOTHED_STEPS
-    time = frame - lag
-    before = np.clip(np.floor(time).astype(int), 0, max(len(path) - 2, 0))
-    after = np.minimum(before + 1, len(path) - 1)
-    fraction = (time - before)[:, None]                  # negative before the first pose
-    there = path[before] + fraction * (path[after] - path[before])
-    motion = se2.between(path[frame], there)
-    return motion, se2.log(se2.between(smooth[before], smooth[after]))
+    last = len(path) - 1
+    nearest = np.clip(np.rint(frame - lag).astype(int), 0, last)
+    first = np.maximum(nearest - SMOOTHED_STEPS, 0)
+    end = np.minimum(nearest + SMOOTHED_STEPS, last)
+    steps = np.maximum(end - first, 1)[:, None]
+    velocity = se2.log(se2.between(path[first], path[end])) / steps
+    since = (frame - lag - nearest)[:, None]             # steps, mostly less than one
+    motion = se2.compose(se2.between(path[frame], path[nearest]), since * velocity)
+    return motion, velocity

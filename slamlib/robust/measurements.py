@@ -16,10 +16,10 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
+import gtsam
 import numpy as np
 from gtsam.noiseModel import mEstimator
 from scipy import sparse
-from scipy.sparse.linalg import splu
 
 from slamlib.core import odometry, se2
 from slamlib.core.graph import ORIGIN_SIGMA, guessed
@@ -187,7 +187,7 @@ def _structure(is_pose, variables):
     count = len(is_pose)
     itself = np.repeat(np.arange(count), 2).reshape(-1, 2)
     pairs = np.concatenate([variables, itself])
-    position = _minimum_degree(pairs)
+    position = _elimination_order(count, variables)
     at = position[pairs]
     in_matrix = count * at[:, [0, 0, 1, 1]] + at[:, [0, 1, 0, 1]]    # row after row
     block, number = np.unique(in_matrix, return_inverse=True)
@@ -200,12 +200,19 @@ def _structure(is_pose, variables):
         diagonal=places.diagonal(), variables=variables, blocks=number[:len(variables)])
 
 
-def _minimum_degree(pairs):
-    """Positions (v,) of variables in the elimination by minimum degree, by pairs (m, 2) of them."""
-    factor = np.repeat(np.arange(len(pairs)), 2)
-    J = sparse.csc_array((np.ones(pairs.size), (factor, pairs.ravel())))
-    information = (J.T @ J).tocsc()                      # only where it is not 0 counts
-    return splu(information, permc_spec="MMD_AT_PLUS_A").perm_c.astype(np.int64)
+def _elimination_order(count, variables):
+    """Positions (v,) of the variables, `count` of them, in the order that COLAMD eliminates them.
+
+    From the two `variables` (m, 2) of each factor. As COLAMD sorts them along the elimination tree,
+    SuperLU is two to four times as fast by it as by its own minimum degree.
+    """
+    graph = gtsam.SymbolicFactorGraph()
+    for variable in range(count):
+        graph.push_factor(variable)
+    for first, second in variables.tolist():
+        graph.push_factor(first, second)
+    order = gtsam.Ordering.ColamdSymbolicFactorGraph(graph)
+    return np.argsort([order.at(k) for k in range(count)])
 
 
 def measure(dataset: Dataset, extra_poses: Sequence[int] = (),

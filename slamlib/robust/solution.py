@@ -3,9 +3,9 @@
 `decisions_of` states what the Fit of the deciding engine found, and `core.graph` builds the graph
 of it. Sightings are custom factors where entries of their calibration are unknown; these entries
 are the variable S(0), in standard deviations from what is stated. Those of the ranges are R(0).
-Gauss-Newton starts from problem 1's odometry. Where it does not converge from there in a few steps
-that are hardly shortened, or ends at a larger error than that of the engine's solution, it starts
-again from this solution.
+Gauss-Newton starts from problem 1's odometry. Where the headings there are too far off, it does not
+converge in a few steps that are hardly shortened, or ends at a larger error than that of the
+engine's solution, it starts from this solution.
 
 Covariances are GTSAM's marginals; those of neighbouring frames together are what encoder poses
 between them follow from. How far the engine's solution is from GTSAM's is part of the result.
@@ -47,7 +47,9 @@ from slamlib.robust.fit import Fit
 from slamlib.robust.initialization import odometry_state
 from slamlib.robust.linear import Problem, State, state_from_arrays
 
-# Number of steps from odometry, and of lengths of each; on a long drive each one is dear.
+# Steps from odometry, which are dear on a long drive: from headings that are at most so far off, in
+# rad; number of steps, and of lengths of each.
+MAX_TURNED = 2.0
 ODOMETRY_STEPS = 8
 ODOMETRY_LENGTHS = 3
 SAME_ERROR = 10 * CONVERGED      # relative difference of errors of one minimum
@@ -295,14 +297,10 @@ def solve_by_gtsam(fit: Fit) -> GtsamSolution:
     """
     problem = fit.problem
     graph = graph_of(problem)
-    decided = values_of(problem, fit.state, graph)
-    odometry = odometry_state(problem.measurements, problem.odometry.model)
-    found = gauss_newton(
-        graph, values_of(problem, odometry, graph), ODOMETRY_STEPS, ODOMETRY_LENGTHS)
+    found = _from_odometry(fit, graph)
     start = FROM_ODOMETRY
-    limit = graph.error(decided)
-    if not found.converged or found.error > limit + SAME_ERROR * (1 + limit):
-        found = gauss_newton(graph, decided)
+    if found is None:
+        found = gauss_newton(graph, values_of(problem, fit.state, graph))
         start = FROM_ENGINE
     values = found.values
     marginals = found.marginals
@@ -315,6 +313,20 @@ def solve_by_gtsam(fit: Fit) -> GtsamSolution:
         c=calibration_covariance(problem, values, marginals),
         factors=graph.size(), variables=values.size(), steps=found.steps, start=start,
         converged=found.converged)
+
+
+def _from_odometry(fit, graph):
+    """GaussNewton from odometry on the graph of a Fit, or None where it misses the minimum."""
+    problem = fit.problem
+    odometry = odometry_state(problem.measurements, problem.odometry.model)
+    turned = odometry.poses[:, 2] - fit.state.poses[:, 2]
+    if np.abs(turned).max() > MAX_TURNED:
+        return None
+    found = gauss_newton(
+        graph, values_of(problem, odometry, graph), ODOMETRY_STEPS, ODOMETRY_LENGTHS)
+    limit = graph.error(values_of(problem, fit.state, graph))
+    is_minimum = found.converged and found.error <= limit + SAME_ERROR * (1 + limit)
+    return found if is_minimum else None
 
 
 def landmark_covariances(problem: Problem, values: gtsam.Values,
