@@ -117,7 +117,7 @@ def _links(sightings, increments, confirmed):
     """
     table = sightings.table()
     is_known = np.zeros(len(sightings.frame), bool)
-    root = int(np.argmax(increments.usable)) if len(increments.usable) else 0
+    root = min(np.flatnonzero(increments.usable), default=0)
     is_known[root] = True
     yield _Link(root)
     for frame in range(root + 1, len(is_known)):

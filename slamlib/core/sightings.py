@@ -99,7 +99,7 @@ def _mean(z, C):
     r = se2.difference(z, z[0])
     covariance = np.linalg.inv(information.sum(0))
     mean = covariance @ np.matvec(information, r).sum(0)
-    squared = np.einsum("ni,nij,nj->n", r - mean, information, r - mean)
+    squared = se2.squared_norms(r - mean, C)
     return z[0] + mean, covariance, np.all(squared < GATE)
 
 
