@@ -36,9 +36,8 @@ LOG = logging.getLogger(__name__)
 class Marginals:
     """Covariances of variables by the Bayes tree of a linear graph, in GTSAM's axes.
 
-    Those of several variables at once by Cholesky's decomposition, which is faster; by QR
-    decomposition for one, and where Cholesky's fails. Raises DatasetError where the factors do not
-    determine a variable.
+    For one variable QR decomposition finds them. For many Cholesky's is faster, and where it fails
+    QR takes its place. Raises DatasetError where the factors do not determine a variable.
     """
 
     tree: gtsam.GaussianBayesTree
@@ -212,14 +211,14 @@ def gauss_newton(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values,
     for steps in range(1, max_steps + 1):
         linear = graph.linearize(values)
         tree, step = eliminated(linear, ordering)
-        moved, new = after_step(graph, values, step, error, max_lengths)
-        LOG.debug("Gauss-Newton step %d: error %.6g", steps, new)
-        if error - new <= CONVERGED * (1 + error):
+        there, new_error = after_step(graph, values, step, error, max_lengths)
+        LOG.debug("Gauss-Newton step %d: error %.6g", steps, new_error)
+        if error - new_error <= CONVERGED * (1 + error):
             promised = linear.error(values.zeroVectors()) - linear.error(step)
-            stuck = new >= error and promised > STUCK * (1 + error)
-            return GaussNewton(gtsam.Values(moved), new, steps, not stuck, Marginals(tree))
-        values = moved
-        error = new
+            stuck = new_error >= error and promised > STUCK * (1 + error)
+            return GaussNewton(gtsam.Values(there), new_error, steps, not stuck, Marginals(tree))
+        values = there
+        error = new_error
     return GaussNewton(gtsam.Values(values), error, max_steps, False, Marginals(tree))
 
 

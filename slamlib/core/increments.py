@@ -201,7 +201,7 @@ def odometry_error(increments: OdometryIncrements, poses: np.ndarray,
     difference, by_measured, by_expected = se2.between_with_jacobians(measured, expected)
     e, J = se2.log_with_jacobian(difference)
     by_first = -J @ by_expected @ se2.by_left_perturbation(expected)
-    by_second = J @ se2.compose_jacobians(difference, np.zeros(3))[1]
+    by_second = J @ se2.compose_jacobians(difference, np.zeros(3))[1]     # X_k moves as X_k exp(xi)
     by_poses = np.concatenate([by_first, by_second], axis=2)
     by_wheel = J @ by_measured @ increments.J_wheel
     if not increments.in_counts:

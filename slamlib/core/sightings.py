@@ -79,7 +79,7 @@ def merge_repeated(aruco: ArucoReadings) -> tuple:
     information matrices, if all of them lie within GATE of the mean. Otherwise all are rejected.
     """
     order = np.lexsort((aruco.marker, aruco.pose))
-    sorted_by_frame = aruco.select(order)
+    sorted_by_frame = aruco.select(order)                 # a copy, in which means replace the first
     z = sorted_by_frame.marker_in_vehicle
     C = sorted_by_frame.covariance
     key = np.stack([sorted_by_frame.pose, sorted_by_frame.marker], -1)
