@@ -345,7 +345,7 @@ def summarize(solved: Solution | Failure, truth: Truth | None) -> dict:
     row = {"title": title, "doubts": [asdict(doubt) for doubt in solved.doubts],
            "estimated_poses": len(known), "world_is_pose": world + 1,
            "last_sigma_m": position_sigmas[-1], "median_sigma_m": np.median(position_sigmas),
-           "median_sigma_heading_rad": np.median(evaluation.sigmas(covariances)[:, 2])}
+           "median_sigma_heading_rad": np.median(se2.sigmas(covariances)[:, 2])}
     row |= solved.facts
     if truth is not None:
         true = se2.between(truth.poses[world], truth.poses)

@@ -16,13 +16,13 @@ from slamlib.core.marker_increments import (
     distance_and_turn_sigmas,
     robust_increments,
 )
-from slamlib.core.returns import find_returns
 from slamlib.core.sightings import (
     consensus,
     merge_repeated,
     regularized,
     sightings_by_frame,
 )
+from slamlib.report.returns import find_returns
 
 DELTA = np.array([0.12, -0.03, 0.2])
 MARKERS = np.array([[1.2, 0.4, 0.3], [-0.7, 1.1, -2.9], [0.2, -1.3, 3.1], [-1.0, -0.8, 1.0]])

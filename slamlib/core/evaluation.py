@@ -11,7 +11,6 @@ import gtsam
 import numpy as np
 
 from slamlib.core import se2
-from slamlib.core.se2 import sigmas
 
 REACH_95 = float(np.sqrt(-2 * np.log(0.05)))    # sigmas, of the 95 % ellipse of a planar Gaussian
 
@@ -92,4 +91,4 @@ def nees_band(count: int, dof: int = 3, probability: float = 0.95) -> tuple[floa
 
 def position_sigmas(covariances: np.ndarray) -> np.ndarray:
     """The larger standard deviation of x and y (n,), of covariances (n, >= 2, >= 2)."""
-    return sigmas(covariances)[:, :2].max(axis=1)
+    return se2.sigmas(covariances)[:, :2].max(axis=1)

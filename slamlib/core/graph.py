@@ -38,7 +38,7 @@ from slamlib.core.sightings import MAX_HEADING_SIGMA, consensus
 
 ORIGIN_SIGMA = 1e-5          # m, of the position of pose 1, which is zero by definition
 GUESS_PRIOR_SIGMA = 5.0      # m, of an antenna about its guessed position
-INDICES = 2**56              # number of indices of GTSAM's symbols; ids below 0 count from the end
+INDICES = 2**56              # number of indices of a symbol; those of ids below 0 are the last
 
 
 @dataclass(frozen=True)
@@ -137,6 +137,12 @@ def guessed(guess: AntennaGuess | None, antennas: np.ndarray) -> dict[int, np.nd
 def index_of(landmark: int) -> int:
     """The index of the symbol of a marker or antenna by its id, which may be negative."""
     return int(landmark) % INDICES
+
+
+def id_of(key: int) -> int:
+    """The id of a marker or antenna by the key of its symbol, the inverse of `index_of`."""
+    index = gtsam.symbolIndex(key)
+    return index if index < INDICES // 2 else index - INDICES
 
 
 def add_odometry(graph: gtsam.NonlinearFactorGraph, decisions: Decisions):

@@ -18,7 +18,7 @@ import numpy as np
 from slamlib.core import se2
 from slamlib.core.batch import FixedValues, numbers
 from slamlib.core.errors import DatasetError
-from slamlib.core.graph import INDICES
+from slamlib.core.graph import id_of
 
 MAX_VARIANCE = 1e12          # m^2 and rad^2, above which a variable is not determined
 CONVERGED = 1e-6             # decrease of the error, over 1 + error, at which steps end
@@ -26,7 +26,7 @@ STUCK = 1e-3                 # the same, promised by a step that brings none: st
 ROUNDING = 1e-12             # relative increase of the error that is due to float rounding
 MAX_STEPS = 30               # number of steps of Gauss-Newton
 MAX_LENGTHS = 8              # number of lengths of one step, each half of the last
-TOGETHER = 64                # number of variables whose joint covariance is asked for at once
+TOGETHER = 64                # number of variables or pairs whose covariance is asked for at once
 MAX_CONTRADICTION = 10.0     # sigmas, of a factor at the solution that is consistent
 
 LOG = logging.getLogger(__name__)
@@ -36,9 +36,8 @@ LOG = logging.getLogger(__name__)
 class Marginals:
     """Covariances of variables by the Bayes tree of a linear graph, in GTSAM's axes.
 
-    Those of several variables at once by Cholesky's decomposition, which is faster; by QR
-    decomposition for one, and where Cholesky's fails. Raises DatasetError where the factors do not
-    determine a variable.
+    For one variable QR decomposition finds them. For many Cholesky's is faster, and where it fails
+    QR takes its place. Raises DatasetError where the factors do not determine a variable.
     """
 
     tree: gtsam.GaussianBayesTree
@@ -48,31 +47,28 @@ class Marginals:
         root, _ = self.tree.marginalFactor(key, gtsam.EliminateQR).jacobian()
         return covariance_of_root(root, key)
 
-    def joint(self, first: int, second: int) -> np.ndarray:
-        """The covariance (d, e) between two variables."""
-        size = len(self.covariance(first))
-        return self.pair(first, second)[:size, size:]
-
     def pair(self, first: int, second: int) -> np.ndarray:
         """The covariance (d + e, d + e) of two variables."""
         return self._of_groups([[first, second]])[0]
 
     def neighbours(self, keys: list[int]) -> np.ndarray:
         """The covariances (n - 1, 6, 6) of each of n poses and the next one."""
-        covariances = []
-        for start in range(0, len(keys) - 1, TOGETHER - 1):
-            covariances += self._of_groups(list(pairwise(keys[start:start + TOGETHER])))
-        return np.reshape(covariances, (-1, 6, 6))
+        pairs = list(pairwise(keys))
+        return np.reshape(self._of_groups(pairs), (-1, 6, 6))
 
     def covariances(self, keys: list[int]) -> list[np.ndarray]:
         """The covariance (d, d) of each variable."""
-        covariances = []
-        for start in range(0, len(keys), TOGETHER):
-            covariances += self._of_groups([[key] for key in keys[start:start + TOGETHER]])
-        return covariances
+        return self._of_groups([[key] for key in keys])
 
     def _of_groups(self, groups):
-        """The covariance of each group of one or two variables, from that of all of them.
+        """The covariance of each group of one or two variables."""
+        covariances = []
+        for start in range(0, len(groups), TOGETHER):
+            covariances += self._of_few(groups[start:start + TOGETHER])
+        return covariances
+
+    def _of_few(self, groups):
+        """The same by the covariance of all of them.
 
         GTSAM walks the tree from them to the root once, in place of once for each group.
         """
@@ -215,14 +211,14 @@ def gauss_newton(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values,
     for steps in range(1, max_steps + 1):
         linear = graph.linearize(values)
         tree, step = eliminated(linear, ordering)
-        moved, new = after_step(graph, values, step, error, max_lengths)
-        LOG.debug("Gauss-Newton step %d: error %.6g", steps, new)
-        if error - new <= CONVERGED * (1 + error):
+        there, new_error = after_step(graph, values, step, error, max_lengths)
+        LOG.debug("Gauss-Newton step %d: error %.6g", steps, new_error)
+        if error - new_error <= CONVERGED * (1 + error):
             promised = linear.error(values.zeroVectors()) - linear.error(step)
-            stuck = new >= error and promised > STUCK * (1 + error)
-            return GaussNewton(gtsam.Values(moved), new, steps, not stuck, Marginals(tree))
-        values = moved
-        error = new
+            stuck = new_error >= error and promised > STUCK * (1 + error)
+            return GaussNewton(gtsam.Values(there), new_error, steps, not stuck, Marginals(tree))
+        values = there
+        error = new_error
     return GaussNewton(gtsam.Values(values), error, max_steps, False, Marginals(tree))
 
 
@@ -323,9 +319,3 @@ def in_world(values: gtsam.Values, symbols: str, covariance_of: Callable[[int], 
     is_pose = np.isfinite(places[:, 2])
     covariances[is_pose] = se2.rotate_covariance(covariances[is_pose], places[is_pose, 2])
     return np.array([id_of(key) for key in keys], int), places, covariances
-
-
-def id_of(key: int) -> int:
-    """The id, which may be negative, by GTSAM's key."""
-    index = gtsam.symbolIndex(key)
-    return index if index < INDICES // 2 else index - INDICES

@@ -18,7 +18,7 @@ import numpy as np
 from slamlib.core import odometry, se2
 from slamlib.core.errors import require
 from slamlib.core.marker_increments import consecutive_increments
-from slamlib.core.records import Dataset
+from slamlib.core.records import NO_SIGHTINGS, Dataset
 from slamlib.core.sightings import sightings_by_frame
 
 
@@ -57,17 +57,15 @@ def fuse_increments(dataset: Dataset, propagation: Callable = odometry.equation2
         if usable[k]:
             deltas, C_deltas = propagation(
                 ticks[part], vehicle, initial_covariance=np.zeros((3, 3)))
+            delta_o = deltas[-1]
+            C_o = C_deltas[-1]
             C_m = found.covariance[k]
-            gain = C_deltas[-1] @ np.linalg.inv(C_deltas[-1] + C_m)
-            delta = deltas[-1] + gain @ se2.difference(found.increment[k], deltas[-1])
-            C_delta = gain @ C_m                             # symmetric but for rounding
+            gain = C_o @ np.linalg.inv(C_o + C_m)
+            delta = delta_o + gain @ se2.difference(found.increment[k], delta_o)
+            C_delta = gain @ C_m                 # (C_o^-1 + C_m^-1)^-1, symmetric but for rounding
             C_delta = (C_delta + C_delta.T) / 2
             poses[end], covariances[end] = se2.compose_uncertain(pose, C, delta, C_delta)
     common = np.stack([found.first, found.second])
     used = np.unique(common[:, found.accepted])
-    return Fusion(poses, covariances, rejected=sighting_count(dataset) - len(used))
-
-
-def sighting_count(dataset: Dataset) -> int:
-    """Number of sightings of a Dataset, 0 without markers."""
-    return 0 if dataset.aruco is None else len(dataset.aruco.pose)
+    aruco = dataset.aruco or NO_SIGHTINGS
+    return Fusion(poses, covariances, rejected=len(aruco.pose) - len(used))

@@ -2,9 +2,9 @@
 
 A wheel that travels s metres slips with variance slip^2 |s|, independently from step to step. Each
 encoder rounds its cumulative count. `rounding_and_slipping` sums what the steps of an increment
-contribute to its noise, `noise_in_drive` is the noise of increments of one drive. An increment
-is the pose `end` in the frame of the pose `start`; both are arrays (m,) of indices from 0. The
-`ticks` (n, 2), `vehicle` and `model` are those of module `odometry`.
+contribute to its noise, `noise_in_drive` adds a skid, and `odometry_noise` what the graph needs at
+rest. An increment is the pose `end` in the frame of the pose `start`; both are arrays (m,) of
+indices from 0. The `ticks` (n, 2), `vehicle` and `model` are those of module `odometry`.
 
 `OdometryIncrements` are those between the frames, the poses that are variables of the graph. An
 increment Delta accumulates all encoder steps from one frame to the next. It is linear in the wheel
@@ -42,14 +42,13 @@ def between_poses(ticks: np.ndarray, vehicle: Vehicle, start: np.ndarray, end: n
 
 def rounding_and_slipping(ticks: np.ndarray, vehicle: Vehicle, start: np.ndarray,
                           end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Covariances of single increments by encoder rounding, and by a slip of 1 sqrt(m).
+    """Covariances of increments of one drive by encoder rounding, and by a slip of 1 sqrt(m).
 
     Both are (m, 3, 3), of [x, y, heading] in the axes of pose `start`; no `end` may be before its
-    `start`. Rounding counts one sixth of a squared count in every step: divided by the number of
-    steps, it is that of both ends. Wheel errors e_R, e_L in the step at p along the unit vector u
-    lengthen the step by (e_R + e_L) / 2. They turn the later path by (e_R - e_L) / b, which moves
-    its end p_e by this angle times S (p_e - p), S = [[0, -1], [1, 0]]. The effect of a step is
-    linear in p_e, so one cumulative sum over the steps serves all increments.
+    `start`. Wheel errors e_R, e_L in the step at p lengthen the step by (e_R + e_L) / 2. They turn
+    the later path by (e_R - e_L) / b, which moves its end p_e by this angle times S (p_e - p),
+    S = [[0, -1], [1, 0]]. The effect of a step is linear in p_e, so one cumulative sum over the
+    steps serves all increments.
 
     The sum is over positions relative to the beginning of a block of steps. Relative to pose 1,
     its differences would lose all digits some ten kilometres away. A block is as long as the
@@ -100,11 +99,19 @@ def _origin_by_wheel_errors(middle, wheelbase):
 
 
 def _wheel_variances(ticks, vehicle):
-    """Variances (n-1, 2, 1, 2) in m^2 of e_R and e_L, by rounding and by a slip of 1 sqrt(m)."""
+    """Variances (n-1, 2, 1, 2) in m^2 of e_R and e_L, by rounding and by a slip of 1 sqrt(m).
+
+    The rounding at a pose enters the increment before it and, with the opposite sign, the one after
+    it. Over consecutive increments only the first and the last rounding remain; independent
+    variances of whole differences would grow like a random walk. Each step therefore has an equal
+    share of the variance of one difference over the drive, 1/6 of a squared count. This neglects
+    the rounding at single poses, at most half a count.
+    """
     step = odometry.steps(ticks, vehicle)
     around = vehicle.wheelbase / 2 * step.dtheta
-    variance = np.empty((len(around), 2, 1, 2))
-    variance[:, 0, 0] = vehicle.metres_per_count**2 / 6
+    count = len(around)
+    variance = np.empty((count, 2, 1, 2))
+    variance[:, 0, 0] = vehicle.metres_per_count**2 / 6 / max(1, count)
     variance[:, 1, 0, 0] = np.abs(step.ds + around)
     variance[:, 1, 0, 1] = np.abs(step.ds - around)
     return variance
@@ -112,17 +119,11 @@ def _wheel_variances(ticks, vehicle):
 
 def noise_in_drive(ticks: np.ndarray, vehicle: Vehicle, start: np.ndarray,
                    end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Noise of increments of one drive by encoder rounding, and by a slip of 1 sqrt(m).
-
-    The rounding at a pose enters the increment before it and, with the opposite sign, the one after
-    it. Over consecutive increments only the first and the last rounding remain; independent
-    variances of whole differences would grow like a random walk. Each increment therefore has a
-    share, by its number of steps, of the variance of one difference of counts over the drive. This
-    neglects the rounding at single poses, at most half a count.
+    """`rounding_and_slipping` of increments of one drive, and their skid.
 
     A single step has hardly any lateral noise. The end of an increment therefore also has a skid of
-    variance MINIMUM_SKID^2 per metre along both axes. Shares and skid are proportional to the
-    steps, so their sum does not depend on the choice of the poses.
+    variance MINIMUM_SKID^2 per metre along both axes. Like the share of the rounding it is
+    proportional to the steps, so the sum does not depend on the choice of the poses.
 
     Parameters
     ----------
@@ -134,11 +135,10 @@ def noise_in_drive(ticks: np.ndarray, vehicle: Vehicle, start: np.ndarray,
         `rounding`. The noise for a slip in sqrt(m) is rounding + slip^2 slipping.
     """
     rounding, slipping = rounding_and_slipping(ticks, vehicle, start, end)
-    steps = max(1, len(ticks) - 1)
     travelled = odometry.cumulative(np.abs(odometry.steps(ticks, vehicle).ds))
     skid = MINIMUM_SKID**2 * (travelled[end] - travelled[start])
     along_both_axes = np.diag([1, 1, 0])
-    return rounding / steps + skid[:, None, None] * along_both_axes, slipping
+    return rounding + skid[:, None, None] * along_both_axes, slipping
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,7 +201,7 @@ def odometry_error(increments: OdometryIncrements, poses: np.ndarray,
     difference, by_measured, by_expected = se2.between_with_jacobians(measured, expected)
     e, J = se2.log_with_jacobian(difference)
     by_first = -J @ by_expected @ se2.by_left_perturbation(expected)
-    by_second = J @ se2.compose_jacobians(difference, np.zeros(3))[1]
+    by_second = J @ se2.compose_jacobians(difference, np.zeros(3))[1]     # X_k moves as X_k exp(xi)
     by_poses = np.concatenate([by_first, by_second], axis=2)
     by_wheel = J @ by_measured @ increments.J_wheel
     if not increments.in_counts:

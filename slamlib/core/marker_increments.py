@@ -73,6 +73,7 @@ class _Common:
         squared = self.linearized(increment).squared
         return np.bincount(self.pair, np.log1p(squared / GATE), self.count)
 
+
 def consecutive_increments(sightings: Sightings) -> MarkerIncrements:
     """MarkerIncrements from every frame of Sightings to the next, usable if plausibly slow.
 
@@ -178,12 +179,12 @@ def _solved(common, linear, J_t_information):
     """
     information = np.zeros((common.count, 3, 3))
     np.add.at(information, common.pair, J_t_information @ linear.J_delta)
-    vector = np.zeros((common.count, 3, 1))
-    np.add.at(vector, common.pair, J_t_information @ linear.r[..., None])
+    vector = np.zeros((common.count, 3))
+    np.add.at(vector, common.pair, np.matvec(J_t_information, linear.r))
     determined = se2.are_regular(information)
     covariance = np.full_like(information, np.nan)
     covariance[determined] = np.linalg.inv(information[determined])
-    return (covariance @ vector)[..., 0], covariance
+    return np.matvec(covariance, vector), covariance
 
 
 def _best_hypothesis(common):
@@ -255,5 +256,6 @@ def distance_and_turn_sigmas(covariance: np.ndarray) -> np.ndarray:
 
     By covariances (n, 3, 3) of the increments.
     """
-    variance = np.diagonal(covariance, axis1=1, axis2=2)
-    return np.sqrt(variance @ [[1, 0], [1, 0], [0, 1]])
+    sigma = se2.sigmas(covariance)
+    distance = np.linalg.norm(sigma[:, :2], axis=1)
+    return np.stack([distance, sigma[:, 2]], axis=-1)

@@ -55,8 +55,8 @@ class _Link(NamedTuple):
     increments: MarkerIncrements | None = None
     pair: int | None = None         # the increment from the parent, in `increments`
 
-    def sightings(self):
-        """Rows of the sightings from parent and frame, and derivatives of the increment by them."""
+    def shared(self):
+        """Rows of the sightings Z_j from parent and Z'_j from frame, and D_j and D'_j of these."""
         found = self.increments
         begin, end = np.searchsorted(found.pair, [self.pair, self.pair + 1])
         rows = slice(begin, end)
@@ -112,12 +112,13 @@ def localize(aruco: ArucoReadings, shared_errors: bool = True) -> Localization:
 def _links(sightings, increments, confirmed):
     """The _Link to each frame that has one, in the order of the frames; the first one is the root.
 
-    From the previous frame by MarkerIncrements, or relocalized. `confirmed` (s,) are the sightings
-    that adjacent frames confirm.
+    A link is the usable increment from the previous frame, else `_relocalized`. The root is the
+    first frame with a usable increment to the next. `confirmed` (s,) are the sightings that
+    adjacent frames confirm.
     """
     table = sightings.table()
     is_known = np.zeros(len(sightings.frame), bool)
-    root = int(np.argmax(increments.usable)) if len(increments.usable) else 0
+    root = min(np.flatnonzero(increments.usable), default=0)
     is_known[root] = True
     yield _Link(root)
     for frame in range(root + 1, len(is_known)):
@@ -174,7 +175,7 @@ def _composed(sightings, links, shared_errors):
         by_increment = B @ link.increments.covariance[link.pair] @ B.T
         covariances[f] = by_parent + by_increment
         if shared_errors:
-            first, second, D, D_later = link.sightings()
+            first, second, D, D_later = link.shared()
             S = A @ np.sum(H[first] @ (B @ D).mT, axis=0)
             covariances[f] += S + S.T
             H[second] = B @ D_later @ sightings.C[second]

@@ -112,20 +112,27 @@ def equation2(ticks: np.ndarray, vehicle: Vehicle, initial_pose: np.ndarray = OR
     return poses, initial_covariance + integral @ integral.mT
 
 
-def step_jacobian(step: Steps, heading: np.ndarray) -> np.ndarray:
+def step_jacobian(step: Steps, heading: np.ndarray, model: str = "euler") -> np.ndarray:
     """Jacobians J_k of equation 2 and equation 3, (n-1, 3, 4), of Steps.
 
     J_k = d(X_{k+1} - X_k) / d w_k with w_k = [R_R, R_L, b, heading_k]. `heading` (n-1,) is that at
-    the start of each Euler step, in rad.
+    the start of each step, in rad.
     """
-    c = np.cos(heading)
-    s = np.sin(heading)
+    bend = _bend(model) * step.dtheta[:, None]
+    bend_by_w = _bend(model) * step.dtheta_by_w
+    chord = np.sinc(bend / np.pi)
+    ds = step.ds[:, None]
+    length = ds * chord
+    length_by_w = chord * step.ds_by_w + ds * _chord_slope(bend) * bend_by_w
+    direction = heading[:, None] + bend
+    c = np.cos(direction)
+    s = np.sin(direction)
     J = np.zeros((len(heading), 3, 4))
-    J[:, 0, :3] = c[:, None] * step.ds_by_w
-    J[:, 1, :3] = s[:, None] * step.ds_by_w
+    J[:, 0, :3] = c * length_by_w - s * length * bend_by_w
+    J[:, 1, :3] = s * length_by_w + c * length * bend_by_w
     J[:, 2, :3] = step.dtheta_by_w
-    J[:, 0, 3] = -s * step.ds
-    J[:, 1, 3] = c * step.ds
+    J[:, 0, 3:] = -s * length
+    J[:, 1, 3:] = c * length
     return J
 
 
@@ -133,26 +140,15 @@ def wheel_jacobian(ticks: np.ndarray, vehicle: Vehicle, initial_heading: float =
                    model: str = "euler") -> np.ndarray:
     """Derivatives (n, 3, 3) of the poses of `dead_reckoning` by [R_R, R_L, b], with pose 1 fixed.
 
-    A wheel-parameter error is constant. It acts in every step and, through the heading, on all
-    later steps: the derivatives accumulate, not the variances. `initial_heading` is in rad.
+    A wheel-parameter error is constant. It acts in every step, by the first columns of J_k, and by
+    the last column through the heading, which earlier steps have turned: the derivatives
+    accumulate, not the variances. `initial_heading` is in rad.
     """
     step = steps(ticks, vehicle)
-    ds = step.ds[:, None]
-    dtheta = step.dtheta[:, None]
-    heading = cumulative(dtheta, initial_heading)
+    heading = cumulative(step.dtheta, initial_heading)
     heading_by_w = cumulative(step.dtheta_by_w)
-    bend = _bend(model) * dtheta
-    bend_by_w = _bend(model) * step.dtheta_by_w
-    direction = heading[:-1] + bend
-    direction_by_w = heading_by_w[:-1] + bend_by_w
-    chord = np.sinc(bend / np.pi)
-    length_by_w = chord * step.ds_by_w + ds * _chord_slope(bend) * bend_by_w
-    sideways = ds * chord * direction_by_w
-    c = np.cos(direction)
-    s = np.sin(direction)
-    x_by_w = cumulative(c * length_by_w - s * sideways)
-    y_by_w = cumulative(s * length_by_w + c * sideways)
-    return np.stack([x_by_w, y_by_w, heading_by_w], axis=1)
+    J = step_jacobian(step, heading[:-1], model)
+    return cumulative(J[:, :, :3] + J[:, :, 3:] * heading_by_w[:-1, None])
 
 
 def first_order(ticks: np.ndarray, vehicle: Vehicle, initial_pose: np.ndarray = ORIGIN,

@@ -80,7 +80,7 @@ class Dataset:
 
     @property
     def sightings(self) -> ArucoReadings | None:
-        """Those in time, in the vehicle, by the stated camera and size; None without markers."""
+        """The `sightings_in_time` in the vehicle, by the stated camera and marker size, or None."""
         in_time = self.sightings_in_time
         if in_time is None:
             return None
@@ -98,9 +98,11 @@ class Dataset:
         """The UwbReadings corrected for the stated offset and scale, or None."""
         if self.uwb is None:
             return None
-        v = self.vehicle
-        return replace(self.uwb, range=(self.uwb.range - v.range_offset) / v.range_scale,
-                       sigma=self.uwb.sigma / v.range_scale)
+        stated = self.vehicle
+        return replace(
+            self.uwb,
+            range=(self.uwb.range - stated.range_offset) / stated.range_scale,
+            sigma=self.uwb.sigma / stated.range_scale)
 
     def without(self, sensor: str) -> "Dataset":
         """The Dataset without a sensor, "aruco" or "uwb"; the same one where it has none."""

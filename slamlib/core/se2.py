@@ -188,7 +188,7 @@ def squared_distances(first: np.ndarray, second: np.ndarray,
 def squared_norms(r: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """r^T C^-1 r, (...), of residuals r (..., d) with covariances C (..., d, d)."""
     weighted = np.linalg.solve(covariance, r[..., None])[..., 0]
-    return np.sum(r * weighted, axis=-1)
+    return np.vecdot(r, weighted)
 
 
 def _turned(T, heading):

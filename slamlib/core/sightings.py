@@ -79,7 +79,7 @@ def merge_repeated(aruco: ArucoReadings) -> tuple:
     information matrices, if all of them lie within GATE of the mean. Otherwise all are rejected.
     """
     order = np.lexsort((aruco.marker, aruco.pose))
-    sorted_by_frame = aruco.select(order)
+    sorted_by_frame = aruco.select(order)                 # a copy, in which means replace the first
     z = sorted_by_frame.marker_in_vehicle
     C = sorted_by_frame.covariance
     key = np.stack([sorted_by_frame.pose, sorted_by_frame.marker], -1)
@@ -99,7 +99,7 @@ def _mean(z, C):
     r = se2.difference(z, z[0])
     covariance = np.linalg.inv(information.sum(0))
     mean = covariance @ np.matvec(information, r).sum(0)
-    squared = np.einsum("ni,nij,nj->n", r - mean, information, r - mean)
+    squared = se2.squared_norms(r - mean, C)
     return z[0] + mean, covariance, np.all(squared < GATE)
 
 

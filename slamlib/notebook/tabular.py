@@ -96,7 +96,7 @@ def accuracy(result, drive) -> dict:
     """
     found = estimates(result, drive)
     position_sigma = evaluation.position_sigmas(found.covariances)
-    heading_sigma = evaluation.sigmas(found.covariances)[:, 2]
+    heading_sigma = se2.sigmas(found.covariances)[:, 2]
     row = {"dataset": drive.name, "σ (mm)": 1e3 * np.median(position_sigma),
            "σ of δ (mrad)": 1e3 * np.median(heading_sigma)}
     if found.true is not None:
@@ -162,7 +162,7 @@ def antenna_rows(result, drive) -> Iterator[dict]:
     error = result.antenna_in_world - true_places(drive, "antenna", ids)
     distance = 1e3 * np.linalg.norm(error, axis=1)
     squared = se2.squared_norms(error, result.antenna_covariance)
-    sigmas = evaluation.sigmas(result.antenna_covariance)
+    sigmas = se2.sigmas(result.antenna_covariance)
     for k, antenna in enumerate(ids):
         name = f"{antenna}"
         if antenna in result.doubts:

@@ -17,7 +17,6 @@ from matplotlib.figure import Figure
 from nbformat import NotebookNode
 from nbformat.v4 import new_markdown_cell, new_notebook
 
-from slamlib.core.returns import find_returns
 from slamlib.core.vehicle import Vehicle
 from slamlib.io.dataset import read_vehicle
 from slamlib.io.results import FIELDS, read_structs, read_summary
@@ -25,6 +24,7 @@ from slamlib.notebook import Drive, plotting, table
 from slamlib.notebook.drives import plain, without_stand_ins
 from slamlib.report.document import address
 from slamlib.report.notebooks import rendered
+from slamlib.report.returns import find_returns
 from slamlib.solve import PROBLEMS, SENSORS, VEHICLE_ESTIMATED, Solution
 
 # Columns of the table of results, in thousandths of these entries of a summary.

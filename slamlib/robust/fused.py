@@ -41,9 +41,9 @@ import numpy as np
 
 from slamlib.core import increments, se2
 from slamlib.core.errors import require
-from slamlib.core.hint import Fusion, sighting_count
+from slamlib.core.hint import Fusion
 from slamlib.core.increments import SLIP_BOUNDS, SLIP_FACTOR, TYPICAL_SLIP
-from slamlib.core.records import Dataset
+from slamlib.core.records import NO_SIGHTINGS, Dataset
 from slamlib.core.sightings import GATE, sightings_by_frame
 from slamlib.robust.calibration import stated_calibration
 from slamlib.robust.error_memory import MAX_PAUSE
@@ -163,7 +163,8 @@ def fuse(dataset: Dataset, slip: float | None = None) -> LearnedFusion:
     P = np.array([state.P[best, :9, :9] for state in states])
     sightings = _sightings(dataset)
     poses, covariances = _poses_from_frames(dataset, jumps, sightings.frame, slip, x, P)
-    repeated = sighting_count(dataset) - len(sightings.row)
+    aruco = dataset.aruco or NO_SIGHTINGS
+    repeated = len(aruco.pose) - len(sightings.row)
     return LearnedFusion(
         poses=poses,
         covariances=covariances,

@@ -351,7 +351,7 @@ def calibration_covariance(problem: Problem, values: gtsam.Values,
             if key == other:
                 block = marginals.covariance(key)
             else:
-                block = marginals.joint(key, other)
+                block = marginals.pair(key, other)[:len(rows), len(rows):]
             of_unknowns[np.ix_(rows, columns)] = block
     root = problem.prior.root
     return root @ of_unknowns @ root.T
