@@ -34,7 +34,7 @@ from slamlib.robust.calibration import (
     SIZE,
     TAG_PLACE,
 )
-from slamlib.robust.factors import SMOOTHED_STEPS, sensor_poses
+from slamlib.robust.factors import sensor_poses
 from slamlib.robust.file_doubts import common_divisor, doubts_before_solving
 from slamlib.robust.initialization import odometry_state
 from slamlib.robust.linear import NormalEquations, build_problem
@@ -49,8 +49,8 @@ MOUNTED = Vehicle(camera_x=0.15, camera_y=-0.08, camera_turn=0.3, marker_size=1.
 DOUBTFUL = {f"sigma_{entry.name}": 0.01 for entry in ENTRIES if entry.group != "camera-bump"}
 
 
-def test_derivatives_by_delays_are_averaged_over_encoder_steps():
-    """Because counts are whole numbers; so are the differences. Three markers are points."""
+def test_derivatives_by_delays_hold_within_a_step():
+    """Between two rows the path, whose counts are whole numbers, does not count."""
     dataset, _ = short(4, 400)
     points = np.isin(dataset.aruco.marker, dataset.aruco.marker[:3])
     dataset = replace(dataset, vehicle=replace(MOUNTED, **DOUBTFUL),
@@ -69,10 +69,10 @@ def test_derivatives_by_delays_are_averaged_over_encoder_steps():
         column = problem.active[:entry].sum()
         J = factors.J_c[..., factors.columns == column] / problem.prior.root[entry, entry]
         numeric = central_differences(
-            lambda lag, kind=kind: linearized(lag)[kind].e, np.zeros(1), SMOOTHED_STEPS / 2)
+            lambda lag, kind=kind: linearized(lag)[kind].e, np.zeros(1), 0.3)
         frame = m.frame[m.structure.variables[factors.index, 0]]
         inside = (frame > 20) & (frame < m.frame[-1] - 20)
-        assert_allclose(J[inside], numeric[inside], atol=0.1 * np.abs(numeric).max())
+        assert_allclose(J[inside], numeric[inside], atol=0.02 * np.abs(numeric).max())
         assert np.abs(J[inside]).max() > 0
 
 

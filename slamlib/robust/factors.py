@@ -95,8 +95,7 @@ def _linearized_sightings(problem, state):
     accepted = problem.accepted.sightings
     rows = np.flatnonzero(accepted.weight)
     frame = m.sightings.row[rows]
-    motion, velocity = delayed(
-        m, frame, state.c[SIGHTING_LAG], not problem.active[SIGHTING_LAG])
+    motion, velocity = delayed(problem, frame, state.c, SIGHTING_LAG)
     e, by_pose, by_marker, by_c = sighting_error(
         m.sightings.z[rows], state.poses[frame], motion, velocity,
         state.markers[m.marker_row[rows]], state.c, m.as_pose[rows], m.is_bumped[rows])
@@ -112,7 +111,7 @@ def _linearized_ranges(problem, state):
     accepted = problem.accepted.ranges
     rows = np.flatnonzero(accepted.weight)
     frame = m.ranges.row[rows]
-    motion, velocity = delayed(m, frame, state.c[RANGE_LAG], not problem.active[RANGE_LAG])
+    motion, velocity = delayed(problem, frame, state.c, RANGE_LAG)
     e, by_pose, by_antenna, by_c = range_error(
         m.ranges.distance[rows], state.poses[frame], motion, velocity, state.antennas,
         m.ranges.antenna[rows], state.c)
@@ -252,7 +251,7 @@ def sensor_poses(measurements: Measurements, poses: np.ndarray,
     From poses (f, 3) of the frames and the calibration c (p,). The tag has the vehicle's heading.
     """
     def in_world(row, lag, place):
-        motion = delayed(measurements, row, lag)[0]
+        motion = _motion_back(measurements, row, lag, round(lag))[0]
         return se2.compose(poses[row], se2.compose(motion, place))
 
     cameras = c[CAMERA] + measurements.is_bumped[:, None] * c[BUMP]
@@ -261,25 +260,33 @@ def sensor_poses(measurements: Measurements, poses: np.ndarray,
     return camera, tag
 
 
-def delayed(measurements: Measurements, row: np.ndarray, lag: float,
-            is_known: bool = True) -> tuple[np.ndarray, np.ndarray]:
-    """Where the vehicle was `lag` encoder steps before the frames `row` (m,), in the axes there.
+def delayed(problem, row: np.ndarray, c: np.ndarray, entry: int) -> tuple[np.ndarray, np.ndarray]:
+    """Where the vehicle was before the frames `row` (m,) by a delay, in the axes there (m, 3).
 
-    Also its velocities (m, 3) per step at that time, in m and rad, averaged, because the noise of
-    single steps would bias the delay. By them the vehicle moves for a part of a step: between two
-    rows the rounding of the counts averages out, which would look like a delay of half a step. Both
-    are 0 (3,) where there is no lag and it `is_known`.
+    The delay in encoder steps is `entry` of the calibration c (p,) of a Problem. Also velocities
+    (m, 3) per step at that time, in m and rad. Both are 0 (3,) where there is no delay and it is
+    known.
     """
-    if is_known and lag == 0:
+    lag = c[entry]
+    if lag == 0 and not problem.active[entry]:
         return np.zeros(3), np.zeros(3)
+    return _motion_back(problem.measurements, row, lag, round(problem.reference[entry]))
+
+
+def _motion_back(measurements, row, lag, whole):
+    """The same by the row `whole` encoder steps before, and from there with an average velocity.
+
+    The noise of single steps would bias the delay. So would the path between two rows, where the
+    rounding of the counts averages out: it would look like a delay of half a step.
+    """
     path = measurements.path
     frame = measurements.frame[row]
     last = len(path) - 1
-    nearest = np.clip(np.rint(frame - lag).astype(int), 0, last)
+    nearest = np.clip(frame - whole, 0, last)
     first = np.maximum(nearest - SMOOTHED_STEPS, 0)
     end = np.minimum(nearest + SMOOTHED_STEPS, last)
     steps = np.maximum(end - first, 1)[:, None]
     velocity = se2.log(se2.between(path[first], path[end])) / steps
-    since = (frame - lag - nearest)[:, None]             # steps, mostly less than one
+    since = (frame - lag - nearest)[:, None]             # steps, few
     motion = se2.compose(se2.between(path[frame], path[nearest]), since * velocity)
     return motion, velocity

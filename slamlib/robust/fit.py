@@ -16,7 +16,7 @@ from gtsam import noiseModel
 
 from slamlib.core.kernels import KERNELS, ONE_SIDED_BIAS
 from slamlib.core.sightings import GATE, MEDIAN_CHI2, POINT_GATE
-from slamlib.robust.calibration import WHEELS
+from slamlib.robust.calibration import RANGE_LAG, SIGHTING_LAG, WHEELS
 from slamlib.robust.error_memory import Memory, error_memory
 from slamlib.robust.factors import linearize_measurements, preintegrate_odometry
 from slamlib.robust.linear import Problem, State, laplace_approximation
@@ -42,6 +42,7 @@ MIN_RESIDUALS = 20           # number of measurements from which their scatter g
 MAX_ROUNDS = 6               # number of rounds of wheels, noise and accepted measurements
 NEGLIGIBLE_MOVE = 3e-3       # relative, of a wheel parameter since odometry was linearised
 SETTLED_MOVE = 1e-4          # the same, at the solution that is handed in
+MAX_SINCE = 0.5              # encoder steps, of a delay since then
 NEGLIGIBLE_CHANGE = 1e-3     # share of the measurements whose weight may change at the same noise
 SIMILAR_SHARE = 0.1          # relative change of a share of memory that is none
 
@@ -117,7 +118,8 @@ def narrow_kernels(
             problem = replace(problem, noise=noise_of_scatter(problem, state))
         cauchy = noiseModel.mEstimator.Cauchy.Create(scale)
         accepted = accept_all(problem.measurements, cauchy)
-        optimum = optimize(replace(problem, accepted=accepted), state, tolerance=ROUGH)
+        problem = replace(problem, accepted=accepted, reference=state.c)
+        optimum = optimize(problem, state, tolerance=ROUGH)
         state = optimum.state
         log.info("Cauchy kernel of %g sigmas: error %.6g after %d steps",
                  scale, optimum.equations.error, optimum.steps)
@@ -211,7 +213,7 @@ def _settled_fit(problem, state, accept):
         problem = _with_errors_in_counts(_with_hidden_errors(problem))
         optimum = optimize(problem, state)
         state = optimum.state
-        accepted = accept(problem, state)
+        accepted = accept(replace(problem, reference=state.c), state)
         changed = sum(np.count_nonzero(_has_changed(new, old))
                       for new, old in zip(accepted, problem.accepted))
         log.info("round %d: slip %.3g mm after 1 m, factors %.3g and %.3g; accepted %d of %d "
@@ -219,7 +221,7 @@ def _settled_fit(problem, state, accept):
                  problem.noise.sightings, problem.noise.ranges,
                  np.count_nonzero(accepted.sightings.weight), len(accepted.sightings.weight),
                  np.count_nonzero(accepted.ranges.weight), len(accepted.ranges.weight), changed)
-        if changed == 0 and _wheel_move(problem, state) < NEGLIGIBLE_MOVE:
+        if changed == 0 and _is_linear(problem, state, NEGLIGIBLE_MOVE):
             break
     return _fit(problem, optimum, posterior)
 
@@ -237,10 +239,10 @@ def _fit(problem, optimum, posterior):
 
 
 def _relinearized(problem, state):
-    """The Problem with odometry linearised at the wheels of a State, with errors in metres."""
+    """The Problem at the wheels and delays of a State, with odometry's errors in metres."""
     odometry = preintegrate_odometry(
         problem.measurements, problem.odometry.model, state.c[WHEELS])
-    return replace(problem, odometry=odometry)
+    return replace(problem, odometry=odometry, reference=state.c)
 
 
 def _with_errors_in_counts(problem):
@@ -248,9 +250,14 @@ def _with_errors_in_counts(problem):
     return replace(problem, odometry=replace(problem.odometry, in_counts=True))
 
 
-def _wheel_move(problem, state):
-    """Largest relative difference of a wheel parameter from where odometry was linearised."""
-    return np.abs(state.c[WHEELS] / problem.odometry.wheel - 1).max()
+def _is_linear(problem, state, max_move):
+    """Whether wheels and delays of a State are near those at which the Problem is linear.
+
+    Wheels within `max_move` of themselves, delays within MAX_SINCE.
+    """
+    wheels = state.c[WHEELS] / problem.odometry.wheel - 1
+    since = (state.c - problem.reference)[[SIGHTING_LAG, RANGE_LAG]]
+    return np.abs(wheels).max() < max_move and np.abs(since).max() < MAX_SINCE
 
 
 def _settle_noise(problem, state):
@@ -258,7 +265,8 @@ def _settle_noise(problem, state):
     optimum = optimize(problem, state, max_steps=2)
     posterior = learn_noise(optimum.equations)
     noise = with_known(posterior.noise, problem.measurements.dataset.vehicle)
-    return replace(problem, noise=noise), optimum.state, posterior
+    problem = replace(problem, noise=noise, reference=optimum.state.c)
+    return problem, optimum.state, posterior
 
 
 def settled(fit: Fit) -> Fit:
@@ -274,7 +282,7 @@ def settled(fit: Fit) -> Fit:
     for _ in range(MAX_ROUNDS):
         optimum = optimize(problem, state)
         state = optimum.state
-        if _wheel_move(problem, state) < SETTLED_MOVE:
+        if _is_linear(problem, state, SETTLED_MOVE):
             break
         problem = _with_errors_in_counts(_relinearized(problem, state))
     return replace(fit, problem=problem, state=state, converged=optimum.converged)

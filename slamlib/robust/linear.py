@@ -77,6 +77,7 @@ class Problem:
     accepted: AcceptedMeasurements
     noise: Noise
     prior: Prior             # of the calibration
+    reference: np.ndarray    # (p,) a calibration, near whose delays sensors move evenly
     memory_first: bool = True    # whether slow errors are sought before the noise is learned
     is_shaken: bool = False      # whether the camera shakes, so that the slip is not learned
 
@@ -98,7 +99,8 @@ def build_problem(measurements: Measurements, model: str, noise: Noise | None = 
         measurements=measurements, odometry=preintegrate_odometry(measurements, model, wheel),
         accepted=accept_all(measurements),
         noise=with_known(noise or Noise(), measurements.dataset.vehicle),
-        prior=measurements.calibration.prior(measurements.jumps.groups))
+        prior=measurements.calibration.prior(measurements.jumps.groups),
+        reference=measurements.calibration.stated)
 
 
 def retract(problem: Problem, state: State, delta: np.ndarray) -> State:

@@ -148,10 +148,9 @@ def add_calibrated_sightings(graph: gtsam.NonlinearFactorGraph, problem: Problem
     rows = np.flatnonzero((accepted.weight > 0) & (m.as_pose == as_pose))
     size = 3 if as_pose else 2
     frame = m.sightings.row[rows]
-    is_known = not problem.active[SIGHTING_LAG]
 
     def errors(poses, markers, c):
-        motion, velocity = delayed(m, frame, c[SIGHTING_LAG], is_known)
+        motion, velocity = delayed(problem, frame, c, SIGHTING_LAG)
         e, by_pose, by_marker, by_c = sighting_error(
             m.sightings.z[rows], poses, motion, velocity, as_places(markers), c, m.as_pose[rows],
             m.is_bumped[rows])
@@ -172,14 +171,13 @@ def add_calibrated_ranges(graph: gtsam.NonlinearFactorGraph, problem: Problem):
     rows = np.flatnonzero(accepted.weight)
     frame = m.ranges.row[rows]
     antenna = m.ranges.antenna[rows]
-    is_known = not problem.active[RANGE_LAG]
     kernel = m.dataset.vehicle.kernel
     sigma = problem.noise.ranges * m.ranges.sigma[rows, None]
     measured = m.ranges.distance[rows]
     bias = ONE_SIDED_BIAS.get(kernel, 0.0) * sigma
 
     def errors(poses, places, c):
-        motion, velocity = delayed(m, frame, c[RANGE_LAG], is_known)
+        motion, velocity = delayed(problem, frame, c, RANGE_LAG)
         antennas = np.zeros((len(m.antenna), 2))
         antennas[antenna] = places
         e, *derivatives = range_error(measured, poses, motion, velocity, antennas, antenna, c)
