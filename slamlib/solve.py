@@ -321,7 +321,7 @@ def finish_results(out: Path, written: Collection[Path], dataset: Dataset, truth
     doubts = doubts_before_solving(dataset)
     with suppress(OSError):
         _, poses, covariances = results.read_structs(out / "problem2_fused", "vehiclePose")
-        _, by_slam, _ = results.read_structs(out / "problem3", "vehiclePose")
+        by_slam = results.read_structs(out / "problem3", "vehiclePose")[1]
         doubts += contradiction_doubts(poses, covariances, by_slam)
     for row in problems.values():
         doubts += [Doubt(**doubt) for doubt in row["doubts"]]

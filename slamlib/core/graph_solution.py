@@ -44,7 +44,7 @@ class Marginals:
 
     def covariance(self, key: int) -> np.ndarray:
         """The covariance (d, d) of a variable."""
-        root, _ = self.tree.marginalFactor(key, gtsam.EliminateQR).jacobian()
+        root = self.tree.marginalFactor(key, gtsam.EliminateQR).jacobian()[0]
         return covariance_of_root(root, key)
 
     def pair(self, first: int, second: int) -> np.ndarray:
@@ -90,7 +90,7 @@ class Marginals:
         ordering = gtsam.Ordering()
         ordering.push_back(first)
         ordering.push_back(second)
-        root, _ = self.tree.joint(first, second, gtsam.EliminateQR).jacobian(ordering)
+        root = self.tree.joint(first, second, gtsam.EliminateQR).jacobian(ordering)[0]
         return covariance_of_root(np.linalg.qr(root, mode="r"), first)
 
 

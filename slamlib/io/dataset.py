@@ -180,7 +180,7 @@ def read_truth(folder: Path | str) -> Truth | None:
     Raises DatasetError if a file does not have the format or the number of poses is not that of the
     drive.
     """
-    drive, _ = contents(folder, ENCODER)
+    drive = contents(folder, ENCODER)[0]
     if "truth" not in drive:
         return None
     files, notes = contents(drive["truth"], TRUE_POSES, TRUTH_FILES)

@@ -75,5 +75,5 @@ def together(numbers: np.ndarray, name: str) -> dict[str, np.ndarray]:
 
 def unrepeated(rows: np.ndarray) -> np.ndarray:
     """True of the rows (m, c) that no row before them equals, (m,) bool."""
-    _, first = np.unique(rows, axis=0, return_index=True)
+    first = np.unique(rows, axis=0, return_index=True)[1]
     return np.isin(np.arange(len(rows)), first)

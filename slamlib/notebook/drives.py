@@ -52,7 +52,7 @@ def read_drives(data: Path, selected: list[str] | None = None) -> list[Drive]:
     Without names they are all, but simulated ones only where no other is there. Raises DatasetError
     if a dataset is not there or does not follow the format.
     """
-    names, _ = datasets_in(data, selected)
+    names = datasets_in(data, selected)[0]
     drives = [Drive(name, read_dataset(data / name), read_truth(data / name)) for name in names]
     drives.sort(key=lambda drive: (drive.origin == "simulated", len(drive.dataset.ticks)))
     return drives if selected else without_stand_ins(drives)

@@ -11,7 +11,8 @@ from slamlib.core.evaluation import position_sigmas
 from slamlib.core.records import NO_RANGES
 from slamlib.notebook import plotting
 
-HALF_WIDTH, WIDTH = 4.08, 7.4      # inches: half the width of the page, and all of it
+HALF_WIDTH = 4.08            # inches, half the width of the page
+WIDTH = 7.4                  # inches, all of it
 FLAT = 0.55                        # height of a map over its width, below which it needs all of it
 ABOVE_AND_BELOW = 0.55             # inches, for title and label
 LEGEND = 0.25                      # inches, height of a line of the legend

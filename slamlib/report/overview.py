@@ -137,7 +137,7 @@ def draw_map(ax: Axes, solution: Solution) -> None:
     """Draw the trajectory of a Solution, and the landmarks that it has."""
     for name, role, size in (("ArucoMap", "marker", 1.5), ("UwbMap", "antenna", 5)):
         if name in solution.maps:
-            _, places, _ = solution.maps[name]
+            places = solution.maps[name][1]
             plotting.landmarks(ax, places, role, f"{role}s", markersize=size)
     _, _, role = PROBLEMS[solution.problem]
     plotting.trajectory(ax, solution.poses, role, "vehicle", linewidth=1.2, linestyle="-")

@@ -393,7 +393,7 @@ def _lead(proposed, present):
 def _with_fixed_weights(fit):
     """AcceptedMeasurements in which weights replace the kernel of the ranges."""
     accepted = fit.problem.accepted
-    _, late = residuals(fit.problem, fit.state)
+    late = residuals(fit.problem, fit.state)[1]
     weight = accepted.ranges.kept(late)
     return accepted._replace(ranges=replace(accepted.ranges, weight=weight, kernel=None))
 
@@ -619,7 +619,7 @@ def _squared_distance(result, first, second, pose, later):
     place = result.marker_in_world[np.searchsorted(result.marker, [first, second])]
     poses = result.poses[[pose, later]]
     P = result.covariances[[pose, later]]
-    A, _ = se2.compose_jacobians(poses, se2.between(poses, place[1]))
+    A = se2.compose_jacobians(poses, se2.between(poses, place[1]))[0]
     C = A @ P @ A.mT
     variance, axes = np.linalg.eigh(C[1] - C[0])
     off = axes.T @ se2.difference(place[1], place[0])

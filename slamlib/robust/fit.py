@@ -233,7 +233,7 @@ def _has_changed(new, old):
 
 def _fit(problem, optimum, posterior):
     """The Fit of a Problem with its Optimum."""
-    _, log_evidence = laplace_approximation(optimum.equations, problem.noise)
+    log_evidence = laplace_approximation(optimum.equations, problem.noise)[1]
     return Fit(problem=problem, state=optimum.state, log_evidence=log_evidence, posterior=posterior,
                converged=optimum.converged)
 

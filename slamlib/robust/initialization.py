@@ -61,8 +61,8 @@ def part_lengths(dataset: Dataset) -> list[int]:
 
     Each part is at most GROWTH times as long as the one before; the last one is the whole drive.
     """
-    _, covariances = odometry.first_order(
-        dataset.ticks, dataset.vehicle, initial_covariance=np.zeros((3, 3)))
+    covariances = odometry.first_order(
+        dataset.ticks, dataset.vehicle, initial_covariance=np.zeros((3, 3)))[1]
     lost = np.flatnonzero(covariances[:, 2, 2] > MAX_ODOMETRY_SIGMA**2)
     length = len(dataset.ticks)
     lengths = [length]

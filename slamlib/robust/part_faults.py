@@ -359,7 +359,7 @@ def _cost(markers, wheels, sigma, by_change):
     """
     e = se2.difference(markers, wheels)[:, :2, None]
     J = np.concatenate([by_change, wheels[:, :2, None]], axis=2)
-    _, squared = _in_common(e, J, sigma[:, :1]**2 / 2)
+    squared = _in_common(e, J, sigma[:, :1]**2 / 2)[1]
     return np.minimum(squared, GATE).sum()
 
 
@@ -384,7 +384,7 @@ def _change(markers, wheels, sigma, by_change):
     weight = 1 / variance
     for _ in range(REWEIGHTED):
         weighted = weight[:, None, None] * J.mT
-        common, _ = _least_squares(np.sum(weighted @ J, axis=0), np.sum(weighted @ e, axis=0))
+        common = _least_squares(np.sum(weighted @ J, axis=0), np.sum(weighted @ e, axis=0))[0]
         left = e - by_factor * common[-1]
         information = np.cumsum(weighted[:, :-1] @ by_change, axis=0)
         right = np.cumsum(weighted[:, :-1] @ left, axis=0)
@@ -408,7 +408,7 @@ def _in_common(e, J, variance, sigma=BUMP_SIGMA):
     kept = np.ones(len(e))
     for _ in range(REWEIGHTED):
         robust = kept[:, None, None] * weighted
-        common, _ = _least_squares(np.sum(robust @ J, axis=0), np.sum(robust @ e, axis=0), sigma)
+        common = _least_squares(np.sum(robust @ J, axis=0), np.sum(robust @ e, axis=0), sigma)[0]
         squared = np.sum((e - J @ common)[:, :, 0]**2 / variance, axis=1)
         kept = _robust_weights(squared, scale_of(squared, e.shape[1]))
     return common, squared
@@ -441,7 +441,7 @@ def slipping_rows(dataset: Dataset) -> np.ndarray:
     if len(wheels) <= 2 * MIN_COUNT:
         return rows
     vehicle = dataset.vehicle
-    _, by_wheel = increments.between_poses(dataset.ticks, vehicle, *poses.T, "arc")
+    by_wheel = increments.between_poses(dataset.ticks, vehicle, *poses.T, "arc")[1]
     by_radii = by_wheel[:, :, :2] * vehicle.wheel[:2]
     variance = sigma[:, [0, 0, 1]]**2 / [2, 2, 1]
     stretch = _other_radii(se2.difference(markers, wheels), by_radii, variance)
@@ -471,8 +471,8 @@ def _other_radii(e, J, variance):
     least = MIN_WHEELS_GAIN * OVERLAP
     longest = max(MIN_COUNT, int(MAX_WHEELS_STRETCH * len(e)))
     for length in np.unique(np.geomspace(MIN_COUNT, longest, STRETCH_LENGTHS).astype(int)):
-        _, gain = _least_squares(information[length:] - information[:-length],
-                                 right[length:] - right[:-length], WHEELS_SIGMA)
+        gain = _least_squares(information[length:] - information[:-length],
+                              right[length:] - right[:-length], WHEELS_SIGMA)[1]
         first = gain.argmax()
         if gain[first] > least:
             least = gain[first]

@@ -140,7 +140,7 @@ def slam_result(fit: Fit) -> SlamResult:
     of_markers, of_antennas = np.split(solution.landmarks, [len(m.marker)])
     of_markers = _with_sighted_headings(m, of_markers)[mapped]
 
-    _, range_residual = residuals(problem, state)
+    range_residual = residuals(problem, state)[1]
     range_weight = problem.accepted.ranges.kept(range_residual)
     doubts, of_antennas = antenna_doubts(
         problem, state, covariances[m.frame], of_antennas[:, :2, :2], range_weight)

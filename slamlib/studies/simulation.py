@@ -248,7 +248,7 @@ def _place_markers(layout, poses, rng):
     place = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     place += spacing * rng.uniform(-0.35, 0.35, place.shape)
 
-    closest, _ = KDTree(path[::10]).query(place)
+    closest = KDTree(path[::10]).query(place)[0]
     gap = path[int(layout.gap_place * len(path))]
     outside_gap = distances(place, gap) > layout.gap_radius
     place = place[(closest < CAMERA_REACH) & outside_gap]
