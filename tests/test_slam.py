@@ -30,7 +30,7 @@ from slamlib.core.kernels import KERNELS, ONE_SIDED_BIAS
 from slamlib.core.records import AntennaGuess, Dataset, UwbReadings
 from slamlib.core.sightings import sightings_by_frame
 from slamlib.core.vehicle import Vehicle
-from slamlib.robust import factors, initialization
+from slamlib.robust import choices, factors, initialization
 from slamlib.robust.choices import DECISIVE_LEAD, better_model, ids_of_places
 from slamlib.robust.fit import accepted_measurements
 from slamlib.robust.initialization import GROWTH, odometry_state, part_lengths
@@ -202,7 +202,10 @@ def test_a_second_place_gets_a_readable_id_that_the_drive_does_not_have():
 
 @pytest.mark.parametrize("legs", [[(60, 0)], [(30, 0), (0.8, np.pi / 2), (30, 0)]])
 def test_nothing_is_released_in_a_clean_corridor(legs, monkeypatch):
-    """Without a loop only what is stated gives the metre: released wheels would run away."""
+    """Without a loop only what is stated gives the metre: released wheels would run away.
+
+    No turn of a straight way tells the wheelbase: asked to release it, the rounds do not end.
+    """
     right, left = COUNT * simulation.manoeuvre(legs)[1:].T
     monkeypatch.setattr(simulation, "_driven_arcs",
                         lambda *_: ((right + left) / 2, (right - left) / 0.4))
@@ -211,6 +214,11 @@ def test_nothing_is_released_in_a_clean_corridor(legs, monkeypatch):
         found = estimate(dataset.without("uwb"))
         assert not found.released and not solution_doubts(found)
         assert mean_nees(found, truth) < 8
+        if len(legs) == 1:
+            calibration = found.fit.problem.measurements.calibration
+            wanted = choices._Proposal(
+                found.fit.explanations, calibration.prior(["wheelbase"]), -np.inf)
+            assert choices._released(found.fit, wanted) is None
 
 
 def test_parts_of_a_drive_grow_at_most_fourfold_from_where_the_heading_is_lost():

@@ -33,7 +33,7 @@ from slamlib.core.errors import DatasetError
 from slamlib.core.odometry import cumulative
 from slamlib.core.records import ArucoReadings, Dataset
 from slamlib.core.sightings import GATE
-from slamlib.robust.calibration import RADII, WHEEL_SCALE, WHEELS, Prior
+from slamlib.robust.calibration import RADII, SCALE, SIZE, WHEEL_SCALE, WHEELS, Prior
 from slamlib.robust.error_memory import runs
 from slamlib.robust.factors import odometry_error, preintegrate_odometry
 from slamlib.robust.fit import Fit, accepted_measurements, refine, residuals
@@ -59,6 +59,8 @@ AMBIGUOUS = 3.0              # log evidence within which explanations cannot be 
 MAX_GROUPS = 5               # number of groups that are wrong at once
 MAX_WIDE_SIGMAS = 4.0        # wide sigmas, of an entry; beyond them a statement is grossly wrong
 GROSS = 10.0                 # factor on the wide sigmas beyond MAX_WIDE_SIGMAS
+FACTORS = [0, 1, 2, SIZE, SCALE]     # entries that are above zero: the wheels, and factors
+MAX_RATIO = 2.5              # of these over what is stated, or the reverse
 MIN_INFORMATION = 1e-3       # about an entry, in wide sigmas, below which it is not considered
 MAX_PROPOSALS = 5            # number of sets that are solved
 MIN_JUMP_LEAD = 10.0         # log evidence by which a jump found at the solution is believed
@@ -220,14 +222,14 @@ class _Proposal(NamedTuple):
 
 
 def _released(fit, proposal):
-    """The Fit with a _Proposal, or None if its evidence does not lead, or it has no solution."""
+    """The Fit with a _Proposal, or None if its evidence does not lead, or it is not solved."""
     stated = fit.problem.measurements.calibration.stated
     c = np.where(proposal.prior.active, fit.state.c, stated)
     problem = replace(fit.problem, prior=proposal.prior)
     names = ", ".join(sorted(proposal.prior.groups)) or "nothing"
     try:
         proposed = refine(problem, replace(fit.state, c=c))
-        lead = _lead(proposed, fit)
+        lead = _lead(proposed, fit) if _is_solved(proposed) else -np.inf
     except (DatasetError, np.linalg.LinAlgError):
         log.info("calibration: %s released, no solution: refused", names)
         return None
@@ -238,6 +240,16 @@ def _released(fit, proposal):
     if not is_kept:
         return None
     return replace(proposed, explanations=proposal.explanations, lead=fit.lead + lead)
+
+
+def _is_solved(fit):
+    """Whether the rounds of a Fit ended, with lengths and factors as they can be.
+
+    On a straight way no turn tells the wheelbase: released, it runs away.
+    """
+    stated = fit.problem.measurements.calibration.stated
+    ratio = fit.state.c[FACTORS] / stated[FACTORS]
+    return fit.converged and ratio.min() > 1 / MAX_RATIO and ratio.max() < MAX_RATIO
 
 
 class _Sets(NamedTuple):

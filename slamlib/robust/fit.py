@@ -156,7 +156,7 @@ class Fit:
     state: State
     log_evidence: float                  # Laplace, up to a constant
     posterior: NoisePosterior | None     # None if all noise parameters are known
-    converged: bool              # whether the last iterations ended before their number did
+    converged: bool              # whether iterations and rounds ended before their number did
     explanations: tuple[frozenset, ...] = (frozenset(),)     # each set of groups explains the drive
     lead: float = 0.0            # log evidence by the groups that left their stated values
 
@@ -234,8 +234,9 @@ def _has_changed(new, old):
 def _fit(problem, optimum, posterior):
     """The Fit of a Problem with its Optimum."""
     log_evidence = laplace_approximation(optimum.equations, problem.noise)[1]
+    is_linear = _is_linear(problem, optimum.state, NEGLIGIBLE_MOVE)
     return Fit(problem=problem, state=optimum.state, log_evidence=log_evidence, posterior=posterior,
-               converged=optimum.converged)
+               converged=optimum.converged and is_linear)
 
 
 def _relinearized(problem, state):
@@ -282,10 +283,11 @@ def settled(fit: Fit) -> Fit:
     for _ in range(MAX_ROUNDS):
         optimum = optimize(problem, state)
         state = optimum.state
-        if _is_linear(problem, state, SETTLED_MOVE):
+        is_linear = _is_linear(problem, state, SETTLED_MOVE)
+        if is_linear:
             break
         problem = _with_errors_in_counts(_relinearized(problem, state))
-    return replace(fit, problem=problem, state=state, converged=optimum.converged)
+    return replace(fit, problem=problem, state=state, converged=optimum.converged and is_linear)
 
 
 def _accepted_with_memory(problem, state, accept):
