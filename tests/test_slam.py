@@ -217,7 +217,7 @@ def test_nothing_is_released_in_a_clean_corridor(legs, monkeypatch):
         if len(legs) == 1:
             calibration = found.fit.problem.measurements.calibration
             wanted = choices._Proposal(
-                found.fit.explanations, calibration.prior(["wheelbase"]), -np.inf)
+                found.fit.explanations, calibration.prior(["wheelbase"]), -1e9)
             assert choices._released(found.fit, wanted) is None
 
 
