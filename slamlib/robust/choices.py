@@ -59,7 +59,7 @@ AMBIGUOUS = 3.0              # log evidence within which explanations cannot be 
 MAX_GROUPS = 5               # number of groups that are wrong at once
 MAX_WIDE_SIGMAS = 4.0        # wide sigmas, of an entry; beyond them a statement is grossly wrong
 GROSS = 10.0                 # factor on the wide sigmas beyond MAX_WIDE_SIGMAS
-FACTORS = [0, 1, 2, SIZE, SCALE]     # entries that are above zero: the wheels, and factors
+POSITIVE = np.r_[WHEELS, SIZE, SCALE]    # entries of the calibration that are above zero
 MAX_RATIO = 2.5              # of these over what is stated, or the reverse
 MIN_INFORMATION = 1e-3       # about an entry, in wide sigmas, below which it is not considered
 MAX_PROPOSALS = 5            # number of sets that are solved
@@ -243,12 +243,12 @@ def _released(fit, proposal):
 
 
 def _is_solved(fit):
-    """Whether the rounds of a Fit ended, with lengths and factors as they can be.
+    """Whether the rounds of a Fit ended, with wheels and scales within MAX_RATIO of the stated.
 
     On a straight way no turn tells the wheelbase: released, it runs away.
     """
     stated = fit.problem.measurements.calibration.stated
-    ratio = fit.state.c[FACTORS] / stated[FACTORS]
+    ratio = fit.state.c[POSITIVE] / stated[POSITIVE]
     return fit.converged and ratio.min() > 1 / MAX_RATIO and ratio.max() < MAX_RATIO
 
 

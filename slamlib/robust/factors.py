@@ -274,7 +274,7 @@ def delayed(problem, row: np.ndarray, c: np.ndarray, entry: int) -> tuple[np.nda
 
 
 def _motion_back(measurements, row, lag, whole):
-    """The same by the row `whole` encoder steps before, and from there with an average velocity.
+    """Motion and velocity as of `delayed`, by the row `whole` steps before and an average velocity.
 
     The noise of single steps would bias the delay. So would the path between two rows, where the
     rounding of the counts averages out: it would look like a delay of half a step.

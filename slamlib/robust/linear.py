@@ -77,7 +77,7 @@ class Problem:
     accepted: AcceptedMeasurements
     noise: Noise
     prior: Prior             # of the calibration
-    reference: np.ndarray    # (p,) a calibration, near whose delays sensors move evenly
+    reference: np.ndarray    # (p,) a calibration, by whose delays rows are chosen
     memory_first: bool = True    # whether slow errors are sought before the noise is learned
     is_shaken: bool = False      # whether the camera shakes, so that the slip is not learned
 

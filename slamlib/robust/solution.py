@@ -295,10 +295,11 @@ def solve_by_gtsam(fit: Fit) -> GtsamSolution:
     """
     problem = fit.problem
     graph = graph_of(problem)
-    found = _from_odometry(fit, graph)
+    decided = values_of(problem, fit.state, graph)
+    found = _from_odometry(fit, graph, decided)
     start = FROM_ODOMETRY
     if found is None:
-        found = gauss_newton(graph, values_of(problem, fit.state, graph))
+        found = gauss_newton(graph, decided)
         start = FROM_ENGINE
     values = found.values
     marginals = found.marginals
@@ -313,8 +314,11 @@ def solve_by_gtsam(fit: Fit) -> GtsamSolution:
         converged=found.converged)
 
 
-def _from_odometry(fit, graph):
-    """GaussNewton from odometry on the graph of a Fit, or None where it misses the minimum."""
+def _from_odometry(fit, graph, decided):
+    """GaussNewton from odometry on the graph of a Fit, or None where it misses the minimum.
+
+    The minimum is near the values `decided`.
+    """
     problem = fit.problem
     odometry = odometry_state(problem.measurements, problem.odometry.model)
     turned = odometry.poses[:, 2] - fit.state.poses[:, 2]
@@ -322,7 +326,7 @@ def _from_odometry(fit, graph):
         return None
     found = gauss_newton(
         graph, values_of(problem, odometry, graph), ODOMETRY_STEPS, ODOMETRY_LENGTHS)
-    limit = graph.error(values_of(problem, fit.state, graph))
+    limit = graph.error(decided)
     is_minimum = found.converged and found.error <= limit + SAME_ERROR * (1 + limit)
     return found if is_minimum else None
 
