@@ -286,6 +286,18 @@ def _proposal(fit):
     return _Proposal(explanations, sets.priors[k], sets.evidence[k] - present)
 
 
+def _lead_of_group(fit, group):
+    """Log evidence of what a Fit releases over that without one group, by its linearisation."""
+    calibration = fit.problem.measurements.calibration
+    prior = fit.problem.prior
+    without = calibration.prior(prior.groups - {group}, prior.width)
+    L, h = _likelihood(fit)
+    roots = _in_wide_sigmas(calibration, L, np.stack([prior.root, without.root]))
+    of_all, of_others = _log_evidence(L, h, roots)[0]
+    log.info("calibration: log evidence %+.1f by %s", of_all - of_others, group)
+    return of_all - of_others
+
+
 def _sets(calibration, L, h, width):
     """The _Sets of up to MAX_GROUPS groups of which the likelihood of L (p, p), h (p,) tells.
 
@@ -425,10 +437,8 @@ def most_consistent(
     """
     bump = camera_bump(dataset)
     fit = _with_jumps(dataset, start, decide, bump)
-    if bump is not None:
-        without = _alternative(start, fit, find_jumps(dataset))
-        if without is not None and _lead_of_jumps(fit, without) < MIN_JUMP_LEAD:
-            fit = _with_jumps(dataset, start, decide, None)
+    if bump is not None and _lead_of_group(fit, "camera-bump") < MIN_JUMP_LEAD:
+        fit = _with_jumps(dataset, start, decide, None)
     if has_rejected_visits(fit):
         no_jumps = fit.problem.measurements.jumps.none()
         places = places_of_ids(dataset.aruco, partial(start, no_jumps, like=fit))
