@@ -202,9 +202,10 @@ def test_a_second_place_gets_a_readable_id_that_the_drive_does_not_have():
 
 @pytest.mark.parametrize("legs", [[(60, 0)], [(30, 0), (0.8, np.pi / 2), (30, 0)]])
 def test_nothing_is_released_in_a_clean_corridor(legs, monkeypatch):
-    """Without a loop only what is stated gives the metre: released wheels would run away.
+    """Without a loop only what is stated gives the metre.
 
-    No turn of a straight way tells the wheelbase: asked to release it, the rounds do not end.
+    On a straight way nothing tells the wheelbase, nor both radii with the size of the markers: they
+    stay near what is stated even if they are released.
     """
     right, left = COUNT * simulation.manoeuvre(legs)[1:].T
     monkeypatch.setattr(simulation, "_driven_arcs",
@@ -216,9 +217,23 @@ def test_nothing_is_released_in_a_clean_corridor(legs, monkeypatch):
         assert mean_nees(found, truth) < 8
         if len(legs) == 1:
             calibration = found.fit.problem.measurements.calibration
-            wanted = choices._Proposal(
-                found.fit.explanations, calibration.prior(["wheelbase"]), -1e9)
-            assert choices._released(found.fit, wanted) is None
+            for groups in (["wheelbase"], ["wheel-scale", "marker-size"]):
+                wanted = choices._Proposal(
+                    found.fit.explanations, calibration.prior(groups), -1e9)
+                c = choices._released(found.fit, wanted).state.c[choices.POSITIVE]
+                assert_allclose(c, calibration.stated[choices.POSITIVE], rtol=0.1)
+
+
+def test_a_wrong_size_in_a_corridor_is_told_with_the_metre_in_doubt(monkeypatch):
+    """Wheels or markers: nothing else gives the metre, so the covariances include both."""
+    right, left = COUNT * simulation.manoeuvre([(60, 0)])[1:].T
+    monkeypatch.setattr(simulation, "_driven_arcs",
+                        lambda *_: ((right + left) / 2, (right - left) / 0.4))
+    dataset, truth = simulation.simulate("short", 5, slip=3e-3)
+    vehicle = replace(dataset.vehicle, marker_size=1.03)
+    found = estimate(replace(dataset, vehicle=vehicle, uwb=None))
+    assert [doubt.what for doubt in solution_doubts(found)] == ["marker-size"]
+    assert mean_nees(found, truth) < 8 and 2e-3 < found.slip < 4e-3
 
 
 def test_parts_of_a_drive_grow_at_most_fourfold_from_where_the_heading_is_lost():
