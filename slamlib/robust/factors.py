@@ -75,13 +75,15 @@ def _by_wheel_without_noise(increments):
         return increments.J_wheel
     steps = np.diff(increments.frame)
     rate = np.pad(turn / steps, TURN_WINDOW // 2, mode="edge")
-    noise = turn - steps * np.median(sliding_window_view(rate, TURN_WINDOW), axis=1)
-    sigma = np.sqrt(increments.covariance(TURN_SLIP)[:, 2, 2])
-    noise[np.abs(noise) > TURN_SIGMAS * sigma] = 0.0
+    typical = steps * np.median(sliding_window_view(rate, TURN_WINDOW), axis=1)
     x, y = increments.increment[:, :2].T / 2
-    by_turn = np.stack([-y, x, np.ones(len(turn))], axis=1)
+    about_middle = np.stack([-y, x, np.ones(len(turn))], axis=1)
+    as_counted = -increments.wheel[2] * increments.J_wheel[:, :, 2]
+    noise = as_counted - typical[:, None] * about_middle
+    sigma = np.sqrt(increments.covariance(TURN_SLIP)[:, 2, 2])
+    noise[np.abs(noise[:, 2]) > TURN_SIGMAS * sigma] = 0.0
     of_wheels = np.array([0.5, 0.5, -1.0]) / increments.wheel        # of the logarithm of a turn
-    return increments.J_wheel - (noise[:, None] * by_turn)[:, :, None] * of_wheels
+    return increments.J_wheel - noise[:, :, None] * of_wheels
 
 
 @dataclass(frozen=True)
