@@ -74,7 +74,7 @@ def _by_wheel_without_noise(increments):
     if not len(turn):
         return increments.J_wheel
     steps = np.diff(increments.frame)
-    rate = np.pad(turn / steps, TURN_WINDOW // 2, mode="edge")
+    rate = np.pad(turn / steps, TURN_WINDOW // 2, mode="symmetric")
     typical = steps * np.median(sliding_window_view(rate, TURN_WINDOW), axis=1)
     x, y = increments.increment[:, :2].T / 2
     about_middle = np.stack([-y, x, np.ones(len(turn))], axis=1)
