@@ -38,6 +38,7 @@ MIN_DISTANCE = 1e-9          # m, below which a range has no direction
 TURN_WINDOW = 41             # number of increments, whose median turn is the typical one
 TURN_SLIP = 1e-2             # sqrt(m), of wheels, by which turns differ from it
 TURN_SIGMAS = 3.0            # of such slip, up to which the difference may be noise
+MAX_TURN_STEPS = 3.0         # of the usual number of steps, of such an increment: not of a gap
 SMOOTHED_STEPS = 5           # encoder steps before and after, over which a velocity is averaged
 
 
@@ -81,7 +82,9 @@ def _by_wheel_without_noise(increments):
     as_counted = -increments.wheel[2] * increments.J_wheel[:, :, 2]
     noise = as_counted - typical[:, None] * about_middle
     sigma = np.sqrt(increments.covariance(TURN_SLIP)[:, 2, 2])
-    noise[np.abs(noise[:, 2]) > TURN_SIGMAS * sigma] = 0.0
+    is_turn = np.abs(noise[:, 2]) > TURN_SIGMAS * sigma
+    is_gap = steps > MAX_TURN_STEPS * np.median(steps)
+    noise[is_turn | is_gap] = 0.0
     of_wheels = np.array([0.5, 0.5, -1.0]) / increments.wheel        # of the logarithm of a turn
     return increments.J_wheel - noise[:, :, None] * of_wheels
 
