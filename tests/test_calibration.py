@@ -231,7 +231,7 @@ def test_wheels_that_drift_and_markers_are_as_likely_although_the_wheels_are_sta
     dataset, truth = drive(13)
     grown = np.linspace(1, 1.02, len(dataset.ticks))[:, None]
     found = estimate(replace(dataset, uwb=None, ticks=np.rint(grown * dataset.ticks)))
-    assert found.released == {"marker-size", "wheel-scale"}
+    assert found.released == {"marker-size", "wheel-radii"}
     assert mean_nees(found, truth) < 8
 
 
