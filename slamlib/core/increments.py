@@ -194,10 +194,7 @@ def odometry_error(increments: OdometryIncrements, poses: np.ndarray,
     to R / b. So the errors shrink with R while Q does not, and all lengths would be estimated too
     small where nothing else gives the scale. The errors by the stated wheels do not shrink:
 
-        s(w) = [R_stated / R, R_stated / R, (R_stated / R_0) (b_0 / b_stated)].
-
-    The turn is scaled by the wheels w_0 of linearisation: the derivative of a scale that varies
-    would contain the noise of the turn, which does not average out (`robust.factors`).
+        s(w) = R_stated / R [1, 1, b / b_stated].
     """
     measured = increments.increment + increments.J_wheel @ (wheel - increments.wheel)
     expected = se2.between(poses[:-1], poses[1:])
@@ -210,12 +207,11 @@ def odometry_error(increments: OdometryIncrements, poses: np.ndarray,
     if not increments.in_counts:
         return e, by_poses, by_wheel
     radius = wheel[:2].mean()
+    wheelbase = wheel[2]
     stated = increments.stated
-    linear = increments.wheel
-    along = stated[:2].mean() / radius
-    turned = stated[:2].mean() / linear[:2].mean() * linear[2] / stated[2]
-    s = np.array([along, along, turned])
-    by_wheel[:, :2, :2] -= e[:, :2, None] / (2 * radius)
+    s = stated[:2].mean() / radius * np.array([1, 1, wheelbase / stated[2]])
+    by_wheel[:, :, :2] -= e[:, :, None] / (2 * radius)
+    by_wheel[:, 2, 2] += e[:, 2] / wheelbase
     return s * e, s[:, None] * by_poses, s[:, None] * by_wheel
 
 

@@ -243,7 +243,10 @@ def _released(fit, proposal):
 
 
 def _is_solved(fit):
-    """Whether the rounds of a Fit ended, with wheels and scales within MAX_RATIO of the stated."""
+    """Whether the rounds of a Fit ended, with wheels and scales within MAX_RATIO of the stated.
+
+    On a straight way no turn tells the wheelbase: released, it runs away.
+    """
     stated = fit.problem.measurements.calibration.stated
     ratio = fit.state.c[POSITIVE] / stated[POSITIVE]
     return fit.converged and ratio.min() > 1 / MAX_RATIO and ratio.max() < MAX_RATIO

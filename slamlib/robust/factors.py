@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
 from slamlib.core import se2
 from slamlib.core.increments import OdometryIncrements, odometry_error, preintegrate
@@ -35,10 +34,6 @@ from slamlib.robust.jumps import creep_covariance
 from slamlib.robust.measurements import Measurements, square_root_information
 
 MIN_DISTANCE = 1e-9          # m, below which a range has no direction
-TURN_WINDOW = 41             # number of increments, whose median turn is the typical one
-TURN_SLIP = 1e-2             # sqrt(m), of wheels, by which turns differ from it
-TURN_SIGMAS = 3.0            # of such slip, up to which the difference may be noise
-MAX_TURN_STEPS = 3.0         # of the usual number of steps, of such an increment: not of a gap
 SMOOTHED_STEPS = 5           # encoder steps before and after, over which a velocity is averaged
 
 
@@ -59,34 +54,7 @@ def preintegrate_odometry(measurements: Measurements, model: str,
     uncertain = jump_covariance + se2.rotate_covariance(creep, -increments.increment[:, 2])
     return replace(
         increments, in_counts=False, increment=se2.compose(increments.increment, jump),
-        J_wheel=_by_wheel_without_noise(increments), rounding=increments.rounding + uncertain)
-
-
-def _by_wheel_without_noise(increments):
-    """The J_wheel of OdometryIncrements for typical turns, where others may be due to noise.
-
-    A turn is proportional to the radii over the wheelbase, so its derivatives contain the turn as
-    it was counted, with the same noise as its error. The products of both do not average out: on
-    long straight ways they make released radii small (errors in variables: Fuller, Measurement
-    Error Models, 1987). The median of neighbouring turns has hardly any of this noise, which turned
-    the increment about its middle.
-    """
-    turn = increments.increment[:, 2]
-    if not len(turn):
-        return increments.J_wheel
-    steps = np.diff(increments.frame)
-    rate = np.pad(turn / steps, TURN_WINDOW // 2, mode="symmetric")
-    typical = steps * np.median(sliding_window_view(rate, TURN_WINDOW), axis=1)
-    x, y = increments.increment[:, :2].T / 2
-    about_middle = np.stack([-y, x, np.ones(len(turn))], axis=1)
-    as_counted = -increments.wheel[2] * increments.J_wheel[:, :, 2]
-    noise = as_counted - typical[:, None] * about_middle
-    sigma = np.sqrt(increments.covariance(TURN_SLIP)[:, 2, 2])
-    is_turn = np.abs(noise[:, 2]) > TURN_SIGMAS * sigma
-    is_gap = steps > MAX_TURN_STEPS * np.median(steps)
-    noise[is_turn | is_gap] = 0.0
-    of_wheels = np.array([0.5, 0.5, -1.0]) / increments.wheel        # of the logarithm of a turn
-    return increments.J_wheel - noise[:, :, None] * of_wheels
+        rounding=increments.rounding + uncertain)
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,7 @@ MIN_RESIDUALS = 20           # number of measurements from which their scatter g
 
 MAX_ROUNDS = 6               # number of rounds of wheels, noise and accepted measurements
 NEGLIGIBLE_MOVE = 3e-3       # relative, of a wheel parameter since odometry was linearised
-SETTLED_MOVE = 1e-6          # the same, at the solution that is handed in
+SETTLED_MOVE = 1e-4          # the same, at the solution that is handed in
 MAX_SINCE = 0.5              # encoder steps, of a delay since then
 NEGLIGIBLE_CHANGE = 1e-3     # share of the measurements whose weight may change at the same noise
 SIMILAR_SHARE = 0.1          # relative change of a share of memory that is none
