@@ -73,6 +73,17 @@ def test_a_moved_camera_is_told_and_costs_problems_2_and_3_nothing():
         assert aligned_ate(solution, truth) < 1.5 * aligned_ate(alone, truth) + 2e-3
 
 
+@pytest.mark.slow
+def test_a_motion_of_the_camera_that_counts_explain_is_not_believed():
+    """Counts that are all doubled look like one at first, and once led metres away with it."""
+    dataset, truth = short(102, 1300)
+    spoilt = replace(dataset, uwb=None, ticks=2 * dataset.ticks)
+    assert camera_bump(spoilt) is not None
+    found = estimate(spoilt)
+    assert found.released == {"wheel-scale"} and found.jumps.bump == np.inf
+    assert aligned_ate(found, truth) < 0.02
+
+
 def test_counts_of_a_patch_on_which_wheels_slip_are_not_used():
     clean, truth = short(21)
     clean = clean.without("uwb")
