@@ -218,6 +218,17 @@ def test_a_wrong_statement_is_named_alone_and_mended_and_not_taken_for_slip(what
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("seed, without", [(502, "uwb"), (505, "")])
+def test_a_wheelbase_of_half_its_length_is_no_second_place_and_no_shaking_camera(seed, without):
+    """The slip is learned again once the wheelbase has moved."""
+    dataset, truth = short(seed)
+    dataset = replace(dataset, vehicle=replace(dataset.vehicle, wheelbase=0.2))
+    found = estimate(dataset.without(without) if without else dataset)
+    assert named(found) - {"antenna"} == {"wheelbase"}
+    assert mean_nees(found, truth) < 8 and 0.6e-3 < found.slip < 1.6e-3
+
+
+@pytest.mark.slow
 def test_wheels_that_only_ranges_contradict_are_told_from_the_scale_of_ranges():
     """The offset and scale of the ranges are two entries that nobody stated; turns tell them."""
     dataset, truth = drive(11)

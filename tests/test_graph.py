@@ -126,7 +126,7 @@ def test_the_graph_is_the_one_by_which_the_engine_decides(groups, kernel):
 
     problem = replace(
         build_problem(m, "arc", Noise(2e-3, 1.5, 0.7)), prior=prior,
-        odometry=replace(preintegrate_odometry(m, "arc", state.c[WHEELS]), in_counts=True))
+        odometry=preintegrate_odometry(m, "arc", state.c[WHEELS]))
     accepted = AcceptedMeasurements(*(
         replace(each, weight=1.0 * (rng.uniform(size=len(each.weight)) < 0.9),
                 share=rng.uniform(0.2, 1, len(each.weight)))

@@ -287,8 +287,7 @@ def test_odometry_tells_no_length_not_even_where_counts_creep_at_a_stand():
     poses = poses[measurements.frame]
 
     def errors(factor, linearised):
-        odometry = replace(preintegrate_odometry(measurements, "arc", linearised * wheel),
-                           in_counts=True)
+        odometry = preintegrate_odometry(measurements, "arc", linearised * wheel)
         e = odometry_error(odometry, poses * [factor, factor, 1], factor * wheel)[0]
         return e, odometry.covariance(1e-3)
 

@@ -26,11 +26,12 @@ from slamlib import estimate
 from slamlib.core import odometry, se2
 from slamlib.core.errors import DatasetError
 from slamlib.core.evaluation import ate
+from slamlib.core.increments import preintegrate
 from slamlib.core.kernels import KERNELS, ONE_SIDED_BIAS
 from slamlib.core.records import AntennaGuess, Dataset, UwbReadings
 from slamlib.core.sightings import sightings_by_frame
 from slamlib.core.vehicle import Vehicle
-from slamlib.robust import choices, factors, initialization
+from slamlib.robust import calibration, choices, factors, initialization
 from slamlib.robust.choices import DECISIVE_LEAD, better_model, ids_of_places
 from slamlib.robust.fit import accepted_measurements
 from slamlib.robust.initialization import GROWTH, odometry_state, part_lengths
@@ -49,15 +50,14 @@ from slamlib.studies import montecarlo, simulation
 COUNT = 2 * np.pi * 0.1 / 8000                            # m
 
 
-@pytest.mark.parametrize("in_counts", [False, True])
-def test_odometry_derivatives_against_central_differences(in_counts):
+def test_odometry_derivatives_against_central_differences():
     """By both poses and by the wheels, off the optimum."""
     rng = np.random.default_rng(0)
     dataset, truth = short(3, 41)
     m = measure(dataset.without("aruco").without("uwb"), [0, 40])
     poses = truth.poses[m.frame] + rng.normal(0, 0.05, (2, 3))
     wheel = dataset.vehicle.wheel + rng.normal(0, 1, 3) * dataset.vehicle.sigma_wheel
-    odometry = replace(build_problem(m, "arc").odometry, in_counts=in_counts)
+    odometry = build_problem(m, "arc").odometry
 
     def error(x):
         moved = se2.compose(poses, x[:6].reshape(2, 3))
@@ -202,9 +202,10 @@ def test_a_second_place_gets_a_readable_id_that_the_drive_does_not_have():
 
 @pytest.mark.parametrize("legs", [[(60, 0)], [(30, 0), (0.8, np.pi / 2), (30, 0)]])
 def test_nothing_is_released_in_a_clean_corridor(legs, monkeypatch):
-    """Without a loop only what is stated gives the metre: released wheels would run away.
+    """Without a loop only what is stated gives the metre.
 
-    No turn of a straight way tells the wheelbase: asked to release it, the rounds do not end.
+    On a straight way nothing tells the wheelbase, nor both radii with the size of the markers: they
+    stay near what is stated even if they are released.
     """
     right, left = COUNT * simulation.manoeuvre(legs)[1:].T
     monkeypatch.setattr(simulation, "_driven_arcs",
@@ -216,9 +217,77 @@ def test_nothing_is_released_in_a_clean_corridor(legs, monkeypatch):
         assert mean_nees(found, truth) < 8
         if len(legs) == 1:
             calibration = found.fit.problem.measurements.calibration
-            wanted = choices._Proposal(
-                found.fit.explanations, calibration.prior(["wheelbase"]), -1e9)
-            assert choices._released(found.fit, wanted) is None
+            for groups in (["wheelbase"], ["wheel-scale", "marker-size"]):
+                wanted = choices._Proposal(
+                    found.fit.explanations, calibration.prior(groups), -1e9)
+                c = choices._released(found.fit, wanted).state.c[choices.POSITIVE]
+                assert_allclose(c, calibration.stated[choices.POSITIVE], rtol=0.1)
+
+
+def test_a_wrong_size_in_a_corridor_is_told_with_the_metre_in_doubt(monkeypatch):
+    """Wheels or markers: nothing else gives the metre, so the covariances include both."""
+    right, left = COUNT * simulation.manoeuvre([(60, 0)])[1:].T
+    monkeypatch.setattr(simulation, "_driven_arcs",
+                        lambda *_: ((right + left) / 2, (right - left) / 0.4))
+    dataset, truth = simulation.simulate("short", 5, slip=3e-3)
+    vehicle = replace(dataset.vehicle, marker_size=1.03)
+    found = estimate(replace(dataset, vehicle=vehicle, uwb=None))
+    assert [doubt.what for doubt in solution_doubts(found)] == ["marker-size"]
+    assert mean_nees(found, truth) < 8 and 2e-3 < found.slip < 4e-3
+
+
+@pytest.mark.parametrize("legs", [[(20, 1.2), (20, -2.0), (20, 0.8)]])
+def test_noise_of_turns_does_not_make_the_wheelbase_long(legs, monkeypatch):
+    """Stated to 5 % on a gently curved way: noise once made it 15 sigmas too long."""
+    right, left = COUNT * simulation.manoeuvre(legs)[1:].T
+    monkeypatch.setattr(simulation, "_driven_arcs",
+                        lambda *_: ((right + left) / 2, (right - left) / 0.4))
+    for seed in (0, 1):
+        dataset, truth = simulation.simulate("short", seed, slip=8e-3)
+        vehicle = replace(dataset.vehicle, sigma_wheelbase=0.02)
+        found = estimate(replace(dataset, vehicle=vehicle, uwb=None))
+        off = found.wheel[2] - truth.vehicle.wheelbase
+        assert abs(off) < 2.5 * found.wheel_covariance[2, 2]**0.5 < 0.06
+
+
+def test_derivatives_have_expected_turns_but_those_of_corners_as_counted():
+    """All wheels larger by one factor lengthen an increment and turn nothing, as before."""
+    corner = [(5, 0), (0, np.pi / 2), (5, 0)]
+    rng = np.random.default_rng(0)
+    ticks = np.rint(simulation.manoeuvre(corner) + rng.normal(0, 10, (1033, 2)))
+    vehicle = short(1)[0].vehicle
+    m = measure(Dataset("corner", vehicle, ticks, None, None, None), np.arange(0, 1033, 10))
+    plain = preintegrate(m.dataset, m.frame)
+    J = factors.preintegrate_odometry(m, "arc", slip=8e-3).J_wheel
+    lengthened = np.column_stack([plain.increment[:, :2], np.zeros(len(J))])
+    assert_allclose(J @ vehicle.wheel, lengthened, atol=1e-9)
+    turn = plain.increment[:, 2]
+    is_corner = turn > 0.2
+    assert 3 <= is_corner.sum() < 20
+    assert_allclose(J[is_corner, 2], plain.J_wheel[is_corner, 2], rtol=0.05)
+    straight = slice(0, 25)
+    assert J[straight, 2, 2].std() < 0.3 * plain.J_wheel[straight, 2, 2].std()
+
+
+@pytest.mark.parametrize("times", [(1.1, 1.1, 1.0), (1.0, 1.0, 1.2), (1.1, 1.1, 1.1)])
+def test_odometry_alone_says_nothing_about_the_wheels(times):
+    """On the path that they make of the counts any wheels have the same evidence."""
+    dataset, _ = short(1, 200)
+    m = measure(dataset.without("aruco").without("uwb"), np.arange(0, 200, 10))
+
+    def evidence(wheel):
+        problem = build_problem(m, "arc", wheel=wheel)
+        known = replace(problem.prior, root=0 * problem.prior.root)
+        vehicle = dataset.vehicle.with_wheel(wheel)
+        poses = odometry.dead_reckoning(dataset.ticks, vehicle, model="arc")[m.frame]
+        c = m.calibration.stated.copy()
+        c[calibration.WHEELS] = wheel
+        state = replace(odometry_state(m, "arc"), poses=poses, c=c)
+        equations = NormalEquations(replace(problem, prior=known), state)
+        return laplace_approximation(equations, problem.noise)[1]
+
+    stated = dataset.vehicle.wheel
+    assert_allclose(evidence(stated * times), evidence(stated), atol=1e-6)
 
 
 def test_parts_of_a_drive_grow_at_most_fourfold_from_where_the_heading_is_lost():

@@ -121,7 +121,7 @@ def test_antenna_from_known_poses_by_hand():
     assert not found.doubts and (found.range_weight > 0.999).all()
 
 
-@pytest.mark.parametrize("without, tolerance", [("uwb", 1e-9), ("", 1e-8), ("aruco", 1e-8)])
+@pytest.mark.parametrize("without, tolerance", [("uwb", 1e-9), ("", 1e-8), ("aruco", 1e-7)])
 def test_perfect_data_gives_the_exact_answer(without, tolerance):
     """As exactly as steps end at an error that is not zero: that of a biased kernel is not."""
     dataset, truth = short(1, noise=False)

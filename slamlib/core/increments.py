@@ -153,7 +153,6 @@ class OdometryIncrements:
     J_wheel: np.ndarray      # (f-1, 3, 3) dDelta/dwheel, per m
     rounding: np.ndarray     # (f-1, 3, 3) covariance without slip, in the axes of the end
     slipping: np.ndarray     # (f-1, 3, 3) covariance of slip 1 sqrt(m), in the same axes
-    in_counts: bool = True   # whether `odometry_error` scales errors to the stated wheels
 
     def covariance(self, slip: float) -> np.ndarray:
         """Q (f-1, 3, 3) for a slip in sqrt(m)."""
@@ -185,16 +184,8 @@ def odometry_error(increments: OdometryIncrements, poses: np.ndarray,
                    wheel: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Errors (f-1, 3) of OdometryIncrements at poses (f, 3) of the frames and `wheel` (3,) m.
 
-    They are s(w) log(Delta(w)^-1 X_i^-1 X_k), not whitened. Also their derivatives (f-1, 3, 6) by
-    the tangent vectors of X_i and X_k, and (f-1, 3, 3) by the wheels.
-
-    With `in_counts` the errors are scaled to the stated wheels. Encoders measure counts, and Q is
-    the noise of the counts, in metres and radians by the stated wheels. With the mean radius R and
-    the wheelbase b of the wheels w, a count is a distance proportional to R and a turn proportional
-    to R / b. So the errors shrink with R while Q does not, and all lengths would be estimated too
-    small where nothing else gives the scale. The errors by the stated wheels do not shrink:
-
-        s(w) = R_stated / R [1, 1, b / b_stated].
+    They are s(w) log(Delta(w)^-1 X_i^-1 X_k), with s(w) of `count_scale`, not whitened. Also their
+    derivatives (f-1, 3, 6) by the tangent vectors of X_i and X_k, and (f-1, 3, 3) by the wheels.
     """
     measured = increments.increment + increments.J_wheel @ (wheel - increments.wheel)
     expected = se2.between(poses[:-1], poses[1:])
@@ -204,15 +195,31 @@ def odometry_error(increments: OdometryIncrements, poses: np.ndarray,
     by_second = J @ se2.compose_jacobians(difference, np.zeros(3))[1]     # X_k moves as X_k exp(xi)
     by_poses = np.concatenate([by_first, by_second], axis=2)
     by_wheel = J @ by_measured @ increments.J_wheel
-    if not increments.in_counts:
-        return e, by_poses, by_wheel
-    radius = wheel[:2].mean()
-    wheelbase = wheel[2]
-    stated = increments.stated
-    s = stated[:2].mean() / radius * np.array([1, 1, wheelbase / stated[2]])
-    by_wheel[:, :, :2] -= e[:, :, None] / (2 * radius)
-    by_wheel[:, 2, 2] += e[:, 2] / wheelbase
+    s = count_scale(increments, wheel)
+    by_wheel[:, :2, :2] -= e[:, :2, None] / wheel[:2].sum()
     return s * e, s[:, None] * by_poses, s[:, None] * by_wheel
+
+
+def count_scale(increments: OdometryIncrements, wheel: np.ndarray) -> np.ndarray:
+    """Scale s(w) (3,) from errors of OdometryIncrements by `wheel` (3,) m to the stated wheels.
+
+    Encoders measure counts, and Q is the noise of the counts, in metres and radians by the stated
+    wheels. With the mean radius R and the wheelbase b of the wheels w, a count is a distance
+    proportional to R and a turn proportional to R / b. So errors shrink with R while Q does not,
+    and all lengths would be estimated too small where nothing else gives the scale. The errors by
+    the stated wheels do not shrink:
+
+        s(w) = [R_stated / R, R_stated / R, (R_stated / R_0) (b_0 / b_stated)].
+
+    The turn is scaled by the wheels w_0 of linearisation: the derivative of a scale that varies
+    would contain the noise of the turn, which does not average out (`robust.factors`).
+    """
+    stated = increments.stated
+    linear = increments.wheel
+    radius = stated[:2].mean()
+    along = radius / wheel[:2].mean()
+    turned = radius / linear[:2].mean() * linear[2] / stated[2]
+    return np.array([along, along, turned])
 
 
 def odometry_noise(ticks: np.ndarray, vehicle: Vehicle, start: np.ndarray,

@@ -123,22 +123,23 @@ def is_shaken(fit: Fit) -> bool:
     An error that all markers of an image share, as where the camera tilts, moves the path there and
     back again. The variance of the sum of independent slips grows with the number of steps, that
     of such errors does not (variance ratio: Lo and MacKinlay, Rev. Financial Studies 1(1), 1988).
-    Rounding of coarse counts does not accumulate, either, but is odometry's.
+    Rounding of coarse counts does not accumulate, either, but is odometry's. Turns are summed, too,
+    since those of a wrong wheelbase do accumulate.
     """
     problem = fit.problem
     slip = problem.noise.slip
     if not problem.measurements.learned[0] or slip < MIN_SHAKEN_SLIP:
         return False
     error = odometry_error(problem.odometry, fit.state.poses, fit.state.c[WHEELS])[0]
-    sigma = np.sqrt(problem.odometry.covariance(slip)[:, 0, 0])
-    if np.median(sigma) < problem.measurements.dataset.vehicle.metres_per_count.max():
+    sigma = np.sqrt(np.diagonal(problem.odometry.covariance(slip), axis1=1, axis2=2))
+    if np.median(sigma[:, 0]) < problem.measurements.dataset.vehicle.metres_per_count.max():
         return False
-    along = error[:, 0] / sigma
-    total = cumulative(along)
+    ahead_and_turned = (error / sigma)[:, [0, 2]]
+    total = cumulative(ahead_and_turned)
     sums = total[SHAKEN_SPAN:] - total[:-SHAKEN_SPAN]
     if len(sums) < MIN_SHAKEN_SPANS * SHAKEN_SPAN:
         return False
-    ratio = np.mean(sums**2) / (SHAKEN_SPAN * np.mean(along**2))
+    ratio = np.mean(sums**2) / (SHAKEN_SPAN * np.mean(ahead_and_turned**2))
     return bool(ratio < MAX_VARIANCE_RATIO)
 
 
@@ -163,8 +164,8 @@ def better_model(fit: Fit) -> Fit:
     present = replace(fit.problem, accepted=_with_fixed_weights(fit))
     model = present.odometry.model
     other = "arc" if model == "euler" else "euler"
-    odometry = replace(preintegrate_odometry(
-        present.measurements, other, present.odometry.wheel), in_counts=True)
+    odometry = preintegrate_odometry(
+        present.measurements, other, present.odometry.wheel, present.noise.slip)
     of_present = _log_evidence_at(fit.state, present)
     of_other = _log_evidence_at(fit.state, replace(present, odometry=odometry))
     needed_lead = DECISIVE_LEAD if other == "euler" else -DECISIVE_LEAD
@@ -243,10 +244,7 @@ def _released(fit, proposal):
 
 
 def _is_solved(fit):
-    """Whether the rounds of a Fit ended, with wheels and scales within MAX_RATIO of the stated.
-
-    On a straight way no turn tells the wheelbase: released, it runs away.
-    """
+    """Whether the rounds of a Fit ended, with wheels and scales within MAX_RATIO of the stated."""
     stated = fit.problem.measurements.calibration.stated
     ratio = fit.state.c[POSITIVE] / stated[POSITIVE]
     return fit.converged and ratio.min() > 1 / MAX_RATIO and ratio.max() < MAX_RATIO
@@ -287,7 +285,7 @@ def _proposal(fit):
 
 
 def _lead_of_group(fit, group):
-    """Log evidence of what a Fit releases over that without one group, by its linearisation."""
+    """By how much a group raises the log evidence of a Fit, at its linearisation."""
     calibration = fit.problem.measurements.calibration
     prior = fit.problem.prior
     without = calibration.prior(prior.groups - {group}, prior.width)
@@ -429,11 +427,12 @@ def most_consistent(
 
     `start` makes the Fit of Jumps and of places, undecided or with the decisions that another Fit
     is `like`, and `decide` decides. Jumps of odometry, or else places of ids, are believed where
-    they spare sightings that are rejected without them, with the same decisions. A few jumps are
-    also believed if the evidence leads and hardly any sighting contradicts them instead, or no
-    marker tells them; a camera that was moved, if the evidence leads. Where a solution stretches
-    odometry beyond the slip that it learned, most of all over a way without markers, one more jump
-    is believed if the evidence leads decisively.
+    they spare sightings that are rejected without them, with the same decisions: places before and
+    after they are decided upon, since a wrong statement can look like them. A few jumps are also
+    believed if the evidence leads and hardly any sighting contradicts them instead, or no marker
+    tells them; a camera that was moved, if the evidence leads. Where a solution stretches odometry
+    beyond the slip that it learned, most of all over a way without markers, one more jump is
+    believed if the evidence leads decisively.
     """
     bump = camera_bump(dataset)
     fit = _with_jumps(dataset, start, decide, bump)
@@ -444,9 +443,13 @@ def most_consistent(
         places = places_of_ids(dataset.aruco, partial(start, no_jumps, like=fit))
         if places is not None:
             count = len(np.unique(places[places[:, 0] != places[:, 1], 1]))
-            alternative = _alternative(start, fit, no_jumps, places)
-            if spares_sightings(alternative, fit, "places of ids", MIN_SPARED * count):
-                return decide(start(no_jumps, places)), places
+            are_needed = partial(
+                spares_sightings, explanation="places of ids", least=MIN_SPARED * count)
+            if are_needed(_alternative(start, fit, no_jumps, places), fit):
+                with_places = decide(start(no_jumps, places))
+                fit = _alternative(start, with_places, no_jumps)
+                if fit is None or are_needed(with_places, fit):
+                    return with_places, places
     jumps = with_stretched(fit)
     if jumps is not None and _lead_of_jumps(_alternative(start, fit, jumps), fit) > MIN_JUMP_LEAD:
         return decide(start(jumps)), None

@@ -12,9 +12,16 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 from slamlib.core import se2
-from slamlib.core.increments import OdometryIncrements, odometry_error, preintegrate
+from slamlib.core.increments import (
+    TYPICAL_SLIP,
+    OdometryIncrements,
+    count_scale,
+    odometry_error,
+    preintegrate,
+)
 from slamlib.robust.calibration import (
     ANTENNAS,
     BUMP,
@@ -34,15 +41,19 @@ from slamlib.robust.jumps import creep_covariance
 from slamlib.robust.measurements import Measurements, square_root_information
 
 MIN_DISTANCE = 1e-9          # m, below which a range has no direction
+TURN_WINDOW = 41             # number of increments, whose turns tell what to expect of one
+TURN_NOISE = 2.0             # times the slip, by which turns are noisy
 SMOOTHED_STEPS = 5           # encoder steps before and after, over which a velocity is averaged
 
 
 def preintegrate_odometry(measurements: Measurements, model: str,
-                          wheel: np.ndarray | None = None) -> OdometryIncrements:
+                          wheel: np.ndarray | None = None,
+                          slip: float = TYPICAL_SLIP) -> OdometryIncrements:
     """The OdometryIncrements of Measurements, linearised at `wheel` (3,) m, None for that stated.
 
-    `model` is "arc" or "euler". Jumps are added where there are some. Where the vehicle crawls the
-    increment is uncertain by itself, as the stated wheels have it: to them all noise belongs.
+    `model` is "arc" or "euler", `slip` is what turns are expected to have, in sqrt(m). Jumps are
+    added where there are some. Where the vehicle crawls the increment is uncertain by itself, as
+    the stated wheels have it: to them all noise belongs.
     """
     frame = measurements.frame
     increments = preintegrate(
@@ -53,8 +64,31 @@ def preintegrate_odometry(measurements: Measurements, model: str,
     creep = creep_covariance(as_stated, measurements.crawls)
     uncertain = jump_covariance + se2.rotate_covariance(creep, -increments.increment[:, 2])
     return replace(
-        increments, in_counts=False, increment=se2.compose(increments.increment, jump),
-        rounding=increments.rounding + uncertain)
+        increments, increment=se2.compose(increments.increment, jump),
+        J_wheel=_by_wheel_without_noise(increments, slip), rounding=increments.rounding + uncertain)
+
+
+def _by_wheel_without_noise(increments, slip):
+    """The J_wheel of OdometryIncrements for the turns that are expected by those counted.
+
+    A turn is proportional to the radii over the wheelbase, so its derivatives contain the turn as
+    it was counted, with the same noise as its error. The products of both do not average out: on
+    long straight ways released wheels would run away. So each turn becomes what is expected, given
+    its neighbours and the noise (regression calibration: Carroll et al., Measurement Error in
+    Nonlinear Models, 2006; by the filter of Lee, IEEE PAMI 2(2), 1980): the mean of the neighbours
+    where all scatter is noise, the turn itself in a corner. The noise turned the increment about
+    its middle.
+    """
+    steps = np.diff(increments.frame)
+    rate = increments.increment[:, 2] / steps
+    mean = uniform_filter1d(rate, TURN_WINDOW)
+    scatter = uniform_filter1d((rate - mean)**2, TURN_WINDOW)
+    variance = increments.covariance(TURN_NOISE * slip)[:, 2, 2] / steps**2
+    noise = steps * (rate - mean) * variance / np.maximum(scatter, variance)
+    x, y = increments.increment[:, :2].T
+    about_middle = np.stack([-y / 2, x / 2, np.ones(len(x))], axis=1)
+    of_wheels = np.array([0.5, 0.5, -1.0]) / increments.wheel        # of the logarithm of a turn
+    return increments.J_wheel - (noise[:, None] * about_middle)[:, :, None] * of_wheels
 
 
 @dataclass(frozen=True)
@@ -68,7 +102,7 @@ class LinearizedFactors:
     columns: np.ndarray      # (u,) their numbers among the q active entries
     error: float = 0.0               # loss of the kernel, of measurements
     count: float = 0.0               # of their errors, as far as they are accepted
-    log_determinant: float = 0.0     # sum log|Q|, of odometry
+    log_determinant: float = 0.0     # sum log|Q / s^2|, of odometry, s its `count_scale`
 
 
 def linearize_odometry(problem, state, slip: float) -> LinearizedFactors:
@@ -76,7 +110,8 @@ def linearize_odometry(problem, state, slip: float) -> LinearizedFactors:
     e, J, by_wheel = odometry_error(problem.odometry, state.poses, state.c[WHEELS])
     U = _odometry_roots(problem.odometry, slip)
     factors = _whitened(problem, np.arange(len(e)), WHEELS, U, e, J, by_wheel)
-    return replace(factors, log_determinant=-2 * np.sum(np.log(np.linalg.diagonal(U))))
+    roots = count_scale(problem.odometry, state.c[WHEELS]) * np.linalg.diagonal(U)
+    return replace(factors, log_determinant=-2 * np.sum(np.log(roots)))
 
 
 @lru_cache(maxsize=4)

@@ -41,7 +41,7 @@ MIN_RESIDUALS = 20           # number of measurements from which their scatter g
 
 MAX_ROUNDS = 6               # number of rounds of wheels, noise and accepted measurements
 NEGLIGIBLE_MOVE = 3e-3       # relative, of a wheel parameter since odometry was linearised
-SETTLED_MOVE = 1e-4          # the same, at the solution that is handed in
+SETTLED_MOVE = 1e-6          # the same, at the solution that is handed in
 MAX_SINCE = 0.5              # encoder steps, of a delay since then
 NEGLIGIBLE_CHANGE = 1e-3     # share of the measurements whose weight may change at the same noise
 SIMILAR_SHARE = 0.1          # relative change of a share of memory that is none
@@ -205,12 +205,12 @@ def _settled_fit(problem, state, accept):
     m = problem.measurements
     posterior = None
     accepted = accept(problem, state)
-    changed = np.inf
+    is_settled = False
     for number in range(1, MAX_ROUNDS + 1):
         problem = _relinearized(replace(problem, accepted=accepted), state)
-        if m.learned.any() and changed > NEGLIGIBLE_CHANGE * len(accepted.share):
+        if m.learned.any() and not is_settled:
             problem, state, posterior = _settle_noise(problem, state)
-        problem = _with_errors_in_counts(_with_hidden_errors(problem))
+        problem = _with_hidden_errors(problem)
         optimum = optimize(problem, state)
         state = optimum.state
         accepted = accept(replace(problem, reference=state.c), state)
@@ -221,8 +221,10 @@ def _settled_fit(problem, state, accept):
                  problem.noise.sightings, problem.noise.ranges,
                  np.count_nonzero(accepted.sightings.weight), len(accepted.sightings.weight),
                  np.count_nonzero(accepted.ranges.weight), len(accepted.ranges.weight), changed)
-        if changed == 0 and _is_linear(problem, state, NEGLIGIBLE_MOVE):
+        is_linear = _is_linear(problem, state, NEGLIGIBLE_MOVE)
+        if changed == 0 and is_linear:
             break
+        is_settled = changed <= NEGLIGIBLE_CHANGE * len(accepted.share) and is_linear
     return _fit(problem, optimum, posterior)
 
 
@@ -240,15 +242,10 @@ def _fit(problem, optimum, posterior):
 
 
 def _relinearized(problem, state):
-    """The Problem at the wheels and delays of a State, with odometry's errors in metres."""
+    """The Problem at the wheels and delays of a State."""
     odometry = preintegrate_odometry(
-        problem.measurements, problem.odometry.model, state.c[WHEELS])
+        problem.measurements, problem.odometry.model, state.c[WHEELS], problem.noise.slip)
     return replace(problem, odometry=odometry, reference=state.c)
-
-
-def _with_errors_in_counts(problem):
-    """The Problem with odometry's errors in counts, which is right once the slip is known."""
-    return replace(problem, odometry=replace(problem.odometry, in_counts=True))
 
 
 def _is_linear(problem, state, max_move):
@@ -286,7 +283,7 @@ def settled(fit: Fit) -> Fit:
         is_linear = _is_linear(problem, state, SETTLED_MOVE)
         if is_linear:
             break
-        problem = _with_errors_in_counts(_relinearized(problem, state))
+        problem = _relinearized(problem, state)
     return replace(fit, problem=problem, state=state, converged=optimum.converged and is_linear)
 
 

@@ -235,18 +235,31 @@ def _log_densities(dataset, jumps, models):
 
 
 def _learned_models(dataset, jumps, slip):
-    """The _Models of the last filters, by the likeliest one in stretches of the drive."""
+    """The _Models of the last filters, by the likeliest one in stretches of the drive.
+
+    First of filters that estimate the camera, then of those with its stated pose, memory and factor
+    as of the first.
+    """
     slips = SLIPS if slip is None else [slip]
     factors = FACTORS if dataset.vehicle.marker_noise_factor is None else [1.0]
-    models = _all_models(slips, MEMORIES, [False, True], factors)
-    best = _log_densities(_stretches(dataset), jumps, models).argmax()
+    stretches = _stretches(dataset)
+
+    def likeliest(memories, elsewhere, factors):
+        models = _all_models(slips, memories, [elsewhere], factors)
+        densities = _log_densities(stretches, jumps, models)
+        best = densities.argmax()
+        return densities[best], _Models(*[field[best] for field in models])
+
+    density, best = likeliest(MEMORIES, True, factors)
+    density_as_stated, as_stated = likeliest([best.memory], False, [best.factor])
+    if density_as_stated >= density:
+        best = as_stated
     if slip is None:
-        are_poor = models.memory[best] > 0 or models.factor[best] > 1    # errors of the sightings
+        are_poor = best.memory > 0 or best.factor > 1    # errors of the sightings
         least = TYPICAL_SLIP if are_poor else SLIP_BOUNDS[0]
-        slips = np.unique(np.clip(models.slip[best] * FINE_STEPS, least, SLIP_BOUNDS[1]))
-    elsewhere = np.unique([False, models.elsewhere[best]])   # stretches say little of the camera
-    return _all_models(
-        slips, [models.memory[best]], elsewhere, [models.factor[best]])
+        slips = np.unique(np.clip(best.slip * FINE_STEPS, least, SLIP_BOUNDS[1]))
+    elsewhere = np.unique([False, best.elsewhere])       # stretches say little of the camera
+    return _all_models(slips, [best.memory], elsewhere, [best.factor])
 
 
 def _all_models(slips, memories, elsewhere, factors):

@@ -95,10 +95,11 @@ def build_problem(measurements: Measurements, model: str, noise: Noise | None = 
     Odometry is of the `model` "arc" or "euler", linearised at `wheel` (3,) m, None for the stated
     one. The calibration is as stated, but for what the Jumps say of the camera.
     """
+    noise = with_known(noise or Noise(), measurements.dataset.vehicle)
     return Problem(
-        measurements=measurements, odometry=preintegrate_odometry(measurements, model, wheel),
-        accepted=accept_all(measurements),
-        noise=with_known(noise or Noise(), measurements.dataset.vehicle),
+        measurements=measurements,
+        odometry=preintegrate_odometry(measurements, model, wheel, noise.slip),
+        accepted=accept_all(measurements), noise=noise,
         prior=measurements.calibration.prior(measurements.jumps.groups),
         reference=measurements.calibration.stated)
 
@@ -125,7 +126,7 @@ class Sums:
     H: np.ndarray            # data of `Structure.matrix`
     border: np.ndarray       # (n + q, q + 1), [[B, g], [D, g_c]]
     squared: float           # sum of squared whitened errors
-    log_determinant: float   # sum log|Q| of the noise Q of odometry
+    log_determinant: float   # sum log|Q| of the noise Q of odometry, by the wheels
 
 
 @dataclass(frozen=True)
@@ -302,9 +303,10 @@ def laplace_approximation(equations: NormalEquations, noise: Noise) -> tuple[np.
 
         log evidence = -|e|^2 / 2 - sum log|Q| / 2 - S log l_s - R log l_r - log|I| / 2
 
-    (MacKay, Neural Computation 4(3), 1992). The omitted constant depends on the dataset and the
-    weights: only problems on the same accepted measurements can be compared. The log evidence is
-    minus infinity where the equations are singular to rounding.
+    (MacKay, Neural Computation 4(3), 1992), with odometry's Q by the wheels of the solution. The
+    omitted constant depends on the dataset and the weights: only problems on the same accepted
+    measurements can be compared. The log evidence is minus infinity where the equations are
+    singular to rounding.
     """
     sums = equations.sums(noise, consistent=True)
     solution = linear_solution(equations.structure, sums)
