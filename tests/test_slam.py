@@ -250,6 +250,21 @@ def test_noise_of_turns_does_not_make_the_wheelbase_long(legs, monkeypatch):
         assert abs(off) < 2.5 * found.wheel_covariance[2, 2]**0.5 < 0.06
 
 
+@pytest.mark.slow
+def test_wrong_wheels_on_a_gentle_way_are_neither_jumps_nor_memory(monkeypatch):
+    """The solution without the jumps that odometry seems to have starts from wheels as decided."""
+    right, left = COUNT * simulation.manoeuvre([(30, 0.6), (30, -1.0), (30, 0.5)])[1:].T
+    monkeypatch.setattr(simulation, "_driven_arcs",
+                        lambda *_: ((right + left) / 2, (right - left) / 0.4))
+    often = replace(simulation.PATHS["short"], aruco_every=10, marker_spacing=1.5)
+    monkeypatch.setitem(simulation.PATHS, "gentle", often)
+    dataset, truth = simulation.simulate("gentle", 7116, slip=3e-3)
+    larger = vehicle(right_radius=0.102, left_radius=0.102)(dataset)
+    found = estimate(replace(larger, uwb=None))
+    assert [doubt.what for doubt in solution_doubts(found)] == ["wheel-scale"]
+    assert mean_nees(found, truth) < 8 and 2e-3 < found.slip < 4e-3
+
+
 def test_derivatives_have_expected_turns_but_those_of_corners_as_counted():
     """All wheels larger by one factor lengthen an increment and turn nothing, as before."""
     corner = [(5, 0), (0, np.pi / 2), (5, 0)]

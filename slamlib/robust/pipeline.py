@@ -145,7 +145,8 @@ def fit_from_odometry(measurements: Measurements, model: str = "arc",
     if like is None:
         return memory_or_slip(problem, state)                                         # 6
     problem = decided_like(problem, like.problem, like.problem.prior)
-    fit = refine(problem, replace(state, c=like.state.c))
+    state = narrow_kernels(problem, replace(state, c=like.state.c), CAUCHY_SCALES[-1:])
+    fit = refine(problem, state)
     return replace(fit, explanations=like.explanations, lead=like.lead)
 
 
