@@ -72,7 +72,7 @@ MIN_SHAKEN_SPANS = 3         # of these, on which it is judged
 MAX_VARIANCE_RATIO = 0.35    # of the sum, over that of independent increments
 HELD_SLIP = 3e-3             # sqrt(m), of wheels under a camera that shakes
 MAX_STILL_CONTRADICTING = 0.5    # of these, by the slip that is believed
-MAX_CONTRADICTING = 0.01     # share of the measurements, by which a small slip may contradict more
+MAX_CONTRADICTING = 0.005    # share of the measurements, by which a small slip may contradict more
 
 VISIT_GAP = 30               # typical intervals between sightings of a marker, that end a visit
 MIN_VISIT = 3                # number of accepted sightings of a visit that is compared
