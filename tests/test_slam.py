@@ -269,6 +269,20 @@ def test_wrong_wheels_on_a_long_way_are_neither_jumps_nor_memory(
     assert mean_nees(found, truth) < 8 and 2e-3 < found.slip < 4e-3
 
 
+@pytest.mark.slow
+def test_a_delay_at_a_corner_is_no_jump(monkeypatch):
+    """Only there does it show; the solution without jumps must be free to find it."""
+    right, left = COUNT * simulation.manoeuvre([(30, 0), (0.8, np.pi / 2), (40, 0)])[1:].T
+    monkeypatch.setattr(simulation, "_driven_arcs",
+                        lambda *_: ((right + left) / 2, (right - left) / 0.4))
+    often = replace(simulation.PATHS["short"], aruco_every=10, marker_spacing=1.5)
+    monkeypatch.setitem(simulation.PATHS, "corner", often)
+    dataset, truth = simulation.simulate("corner", 7128, slip=3e-3)
+    found = estimate(replace(vehicle(sighting_lag=6.0)(dataset), uwb=None))
+    assert [doubt.what for doubt in solution_doubts(found)] == ["time-offset"]
+    assert mean_nees(found, truth) < 8
+
+
 def test_derivatives_have_expected_turns_but_those_of_corners_as_counted():
     """All wheels larger by one factor lengthen an increment and turn nothing, as before."""
     corner = [(5, 0), (0, np.pi / 2), (5, 0)]

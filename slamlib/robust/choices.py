@@ -427,12 +427,12 @@ def most_consistent(
 
     `start` makes the Fit of Jumps and of places, undecided or with the decisions that another Fit
     is `like`, and `decide` decides. Jumps of odometry, or else places of ids, are believed where
-    they spare sightings that are rejected without them, with the same decisions: places before and
-    after they are decided upon, since a wrong statement can look like them. A few jumps are also
-    believed if the evidence leads and hardly any sighting contradicts them instead, or no marker
-    tells them; a camera that was moved, if the evidence leads. Where a solution stretches odometry
-    beyond the slip that it learned, most of all over a way without markers, one more jump is
-    believed if the evidence leads decisively.
+    they spare sightings that are rejected without them, with the same decisions. These are made
+    anew without jumps, and with places, since a wrong statement can look like both. A few jumps are
+    also believed if the evidence leads and hardly any sighting contradicts them instead, or no
+    marker tells them; a camera that was moved, if the evidence leads. Where a solution stretches
+    odometry beyond the slip that it learned, most of all over a way without markers, one more jump
+    is believed if the evidence leads decisively.
     """
     bump = camera_bump(dataset)
     fit = _with_jumps(dataset, start, decide, bump)
@@ -475,6 +475,8 @@ def _with_jumps(dataset, start, decide, bump):
     fit = decide(start(jumps if jumps.are_few else no_jumps))
     if jumps.are_few:
         without = _alternative(start, fit, no_jumps)
+        if without is not None:
+            without = decide(without)
         are_told = (jumps.sigma < UNKNOWN_SIGMA).all()           # by markers
         if without is not None and are_told:
             is_led = _lead_of_jumps(fit, without) >= MIN_JUMP_LEAD
