@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
 
 from slamlib.core import se2
 from slamlib.core.increments import (
@@ -81,14 +80,22 @@ def _by_wheel_without_noise(increments, slip):
     """
     steps = np.diff(increments.frame)
     rate = increments.increment[:, 2] / steps
-    mean = uniform_filter1d(rate, TURN_WINDOW)
-    scatter = uniform_filter1d((rate - mean)**2, TURN_WINDOW)
+    mean = _mean_of_neighbours(rate)
+    scatter = _mean_of_neighbours((rate - mean)**2)
     variance = increments.covariance(TURN_NOISE * slip)[:, 2, 2] / steps**2
     noise = steps * (rate - mean) * variance / np.maximum(scatter, variance)
     x, y = increments.increment[:, :2].T
     about_middle = np.stack([-y / 2, x / 2, np.ones(len(x))], axis=1)
     of_wheels = np.array([0.5, 0.5, -1.0]) / increments.wheel        # of the logarithm of a turn
     return increments.J_wheel - (noise[:, None] * about_middle)[:, :, None] * of_wheels
+
+
+def _mean_of_neighbours(values):
+    """Means (m,) of the TURN_WINDOW values (m,) around each, mirrored at both ends."""
+    if not len(values):
+        return values
+    mirrored = np.pad(values, TURN_WINDOW // 2, mode="symmetric")
+    return np.convolve(mirrored, np.full(TURN_WINDOW, 1 / TURN_WINDOW), mode="valid")
 
 
 @dataclass(frozen=True)
