@@ -200,6 +200,15 @@ def test_a_second_place_gets_a_readable_id_that_the_drive_does_not_have():
     assert_array_equal(found, [-7, 93, -107, 0, 100, 12, 212])
 
 
+def drive_along(legs, monkeypatch, **layout):
+    """Simulated drives follow these legs, "short" and, with this layout, "way"."""
+    right, left = COUNT * simulation.manoeuvre(legs)[1:].T
+    monkeypatch.setattr(simulation, "_driven_arcs",
+                        lambda *_: ((right + left) / 2, (right - left) / 0.4))
+    way = replace(simulation.PATHS["short"], **layout)
+    monkeypatch.setitem(simulation.PATHS, "way", way)
+
+
 @pytest.mark.parametrize("legs", [[(60, 0)], [(30, 0), (0.8, np.pi / 2), (30, 0)]])
 def test_nothing_is_released_in_a_clean_corridor(legs, monkeypatch):
     """Without a loop only what is stated gives the metre.
@@ -207,9 +216,7 @@ def test_nothing_is_released_in_a_clean_corridor(legs, monkeypatch):
     On a straight way nothing tells the wheelbase, nor both radii with the size of the markers: they
     stay near what is stated even if they are released.
     """
-    right, left = COUNT * simulation.manoeuvre(legs)[1:].T
-    monkeypatch.setattr(simulation, "_driven_arcs",
-                        lambda *_: ((right + left) / 2, (right - left) / 0.4))
+    drive_along(legs, monkeypatch)
     for seed in (0, 1):
         dataset, truth = simulation.simulate("short", seed, slip=3e-3)
         found = estimate(dataset.without("uwb"))
@@ -226,9 +233,7 @@ def test_nothing_is_released_in_a_clean_corridor(legs, monkeypatch):
 
 def test_a_wrong_size_in_a_corridor_is_told_with_the_metre_in_doubt(monkeypatch):
     """Wheels or markers: nothing else gives the metre, so the covariances include both."""
-    right, left = COUNT * simulation.manoeuvre([(60, 0)])[1:].T
-    monkeypatch.setattr(simulation, "_driven_arcs",
-                        lambda *_: ((right + left) / 2, (right - left) / 0.4))
+    drive_along([(60, 0)], monkeypatch)
     dataset, truth = simulation.simulate("short", 5, slip=3e-3)
     vehicle = replace(dataset.vehicle, marker_size=1.03)
     found = estimate(replace(dataset, vehicle=vehicle, uwb=None))
@@ -236,12 +241,9 @@ def test_a_wrong_size_in_a_corridor_is_told_with_the_metre_in_doubt(monkeypatch)
     assert mean_nees(found, truth) < 8 and 2e-3 < found.slip < 4e-3
 
 
-@pytest.mark.parametrize("legs", [[(20, 1.2), (20, -2.0), (20, 0.8)]])
-def test_noise_of_turns_does_not_make_the_wheelbase_long(legs, monkeypatch):
-    """Stated to 5 % on a gently curved way: noise once made it 15 sigmas too long."""
-    right, left = COUNT * simulation.manoeuvre(legs)[1:].T
-    monkeypatch.setattr(simulation, "_driven_arcs",
-                        lambda *_: ((right + left) / 2, (right - left) / 0.4))
+def test_noise_of_turns_does_not_make_the_wheelbase_long(monkeypatch):
+    """Stated to 5 % on a gently curved way: noise once made it ten sigmas too long, or more."""
+    drive_along([(20, 1.2), (20, -2.0), (20, 0.8)], monkeypatch)
     for seed in (0, 1):
         dataset, truth = simulation.simulate("short", seed, slip=8e-3)
         vehicle = replace(dataset.vehicle, sigma_wheelbase=0.02)
@@ -257,11 +259,7 @@ def test_noise_of_turns_does_not_make_the_wheelbase_long(legs, monkeypatch):
 def test_wrong_wheels_on_a_long_way_are_neither_jumps_nor_memory(
         legs, every, seed, radii, group, monkeypatch):
     """Odometry seems to have jumps, or the sightings slow errors; neither is believed."""
-    right, left = COUNT * simulation.manoeuvre(legs)[1:].T
-    monkeypatch.setattr(simulation, "_driven_arcs",
-                        lambda *_: ((right + left) / 2, (right - left) / 0.4))
-    often = replace(simulation.PATHS["short"], aruco_every=every, marker_spacing=1.5)
-    monkeypatch.setitem(simulation.PATHS, "way", often)
+    drive_along(legs, monkeypatch, aruco_every=every, marker_spacing=1.5)
     dataset, truth = simulation.simulate("way", seed, slip=3e-3)
     wrong = vehicle(right_radius=radii[0], left_radius=radii[1])(dataset)
     found = estimate(replace(wrong, uwb=None))
@@ -272,12 +270,9 @@ def test_wrong_wheels_on_a_long_way_are_neither_jumps_nor_memory(
 @pytest.mark.slow
 def test_a_delay_at_a_corner_is_no_jump(monkeypatch):
     """Only there does it show; the solution without jumps must be free to find it."""
-    right, left = COUNT * simulation.manoeuvre([(30, 0), (0.8, np.pi / 2), (40, 0)])[1:].T
-    monkeypatch.setattr(simulation, "_driven_arcs",
-                        lambda *_: ((right + left) / 2, (right - left) / 0.4))
-    often = replace(simulation.PATHS["short"], aruco_every=10, marker_spacing=1.5)
-    monkeypatch.setitem(simulation.PATHS, "corner", often)
-    dataset, truth = simulation.simulate("corner", 7128, slip=3e-3)
+    legs = [(30, 0), (0.8, np.pi / 2), (40, 0)]
+    drive_along(legs, monkeypatch, aruco_every=10, marker_spacing=1.5)
+    dataset, truth = simulation.simulate("way", 7128, slip=3e-3)
     found = estimate(replace(vehicle(sighting_lag=6.0)(dataset), uwb=None))
     assert [doubt.what for doubt in solution_doubts(found)] == ["time-offset"]
     assert mean_nees(found, truth) < 8
