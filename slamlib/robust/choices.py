@@ -427,12 +427,13 @@ def most_consistent(
 
     `start` makes the Fit of Jumps and of places, undecided or with the decisions that another Fit
     is `like`, and `decide` decides. Jumps of odometry, or else places of ids, are believed where
-    they spare sightings that are rejected without them, with the same decisions. These are made
-    anew without jumps, and with places, since a wrong statement can look like both. A few jumps are
-    also believed if the evidence leads and hardly any sighting contradicts them instead, or no
-    marker tells them; a camera that was moved, if the evidence leads. Where a solution stretches
-    odometry beyond the slip that it learned, most of all over a way without markers, one more jump
-    is believed if the evidence leads decisively.
+    they spare sightings that are rejected without them, with the same decisions. A wrong statement
+    can look like jumps or places, so the Fit without jumps, and that with places, is free to find
+    one before it is compared with the other. A few jumps are also believed if the evidence leads
+    and hardly any sighting contradicts them instead, or no marker tells them; a camera that was
+    moved, if the evidence leads. Where a solution stretches odometry beyond the slip that it
+    learned, most of all over a way without markers, one more jump is believed if the evidence leads
+    decisively.
     """
     bump = camera_bump(dataset)
     fit = _with_jumps(dataset, start, decide, bump)

@@ -50,7 +50,7 @@ def preintegrate_odometry(measurements: Measurements, model: str,
                           slip: float = TYPICAL_SLIP) -> OdometryIncrements:
     """The OdometryIncrements of Measurements, linearised at `wheel` (3,) m, None for that stated.
 
-    `model` is "arc" or "euler", `slip` is what turns are expected to have, in sqrt(m). Jumps are
+    `model` is "arc" or "euler", `slip` in sqrt(m) tells how much of a turn may be noise. Jumps are
     added where there are some. Where the vehicle crawls the increment is uncertain by itself, as
     the stated wheels have it: to them all noise belongs.
     """
@@ -68,7 +68,7 @@ def preintegrate_odometry(measurements: Measurements, model: str,
 
 
 def _by_wheel_without_noise(increments, slip):
-    """The J_wheel of OdometryIncrements for the turns that are expected by those counted.
+    """The J_wheel of OdometryIncrements, from whose turns the noise is taken as far as it shows.
 
     A turn is proportional to the radii over the wheelbase, so its derivatives contain the turn as
     it was counted, with the same noise as its error. The products of both do not average out: on

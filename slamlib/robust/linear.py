@@ -126,7 +126,7 @@ class Sums:
     H: np.ndarray            # data of `Structure.matrix`
     border: np.ndarray       # (n + q, q + 1), [[B, g], [D, g_c]]
     squared: float           # sum of squared whitened errors
-    log_determinant: float   # sum log|Q| of the noise Q of odometry, by the wheels
+    log_determinant: float   # sum log|Q| of odometry, in the metres of its wheels
 
 
 @dataclass(frozen=True)
