@@ -107,11 +107,12 @@ def test_what_is_stated_is_what_the_table_says(height, sigma):
         assert_allclose(found, 2 * of_vehicle, rtol=1e-6)
 
 
-def proposed(monkeypatch, vehicle, entries, L, h):
+def proposed(monkeypatch, vehicle, entries, L, h, variance=1.0):
     """The proposal for a drive that informs of the sum of these entries (list of int) only."""
     stated = calibration.stated_calibration(vehicle, [])
     of_sum = np.isin(np.arange(len(ENTRIES)), entries)
-    likelihood = L * np.outer(of_sum, of_sum), h * of_sum
+    likelihood = choices._Likelihood(
+        L * np.outer(of_sum, of_sum), h * of_sum, variance, 0.1 * np.tile(of_sum, (2, 1)))
     monkeypatch.setattr(choices, "_likelihood", lambda fit: likelihood)
     problem = SimpleNamespace(measurements=SimpleNamespace(calibration=stated),
                               prior=stated.prior())
@@ -133,10 +134,16 @@ def test_what_a_drive_cannot_tell_apart_by_hand(monkeypatch, off, sigma, named):
         assert found.lead == pytest.approx(2500 / 201 - np.log(201) / 2)
 
 
-@pytest.mark.parametrize("h, released", [(1.0, set()), (2.0, {"marker-size"})])
-def test_what_raises_the_evidence_is_released_also_if_it_is_not_told(monkeypatch, h, released):
-    """L = 1.5 in the size: evidence h^2 / 5 - log(2.5) / 2, above 0 from h = 1.51 on."""
-    found = proposed(monkeypatch, Vehicle(), [SIZE], 1.5, h)
+@pytest.mark.parametrize("h, variance, released", [
+    (1.0, 1.0, set()), (2.0, 1.0, {"marker-size"}), (2.0, 7e-3, {"marker-size"}), (2.0, 6e-3, set())])
+def test_what_raises_the_evidence_is_released_also_if_it_is_not_told(
+        monkeypatch, h, variance, released):
+    """L = 1.5 in the size: evidence h^2 / 5 - log(2.5) / 2, above 0 from h = 1.51 on.
+
+    The last position has a lever of 0.1 m in x and y: its variance grows by 0.02 / 2.5, its sigma
+    to less than 1.5 times its own from 0.0064 m^2 on.
+    """
+    found = proposed(monkeypatch, Vehicle(), [SIZE], 1.5, h, variance)
     assert found.explanations == (frozenset(),) and found.prior.groups == released
 
 

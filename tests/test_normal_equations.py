@@ -1,6 +1,7 @@
 """The linearised graph: normal equations, GTSAM's equal ones, and blocks of the inverse."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from scipy.special import chdtri
 from slamlib.core import sightings
 from slamlib.core.errors import DatasetError
 from slamlib.core.kernels import KERNELS
-from slamlib.robust import linear
+from slamlib.robust import choices, linear
 from slamlib.robust.calibration import ENTRIES
 from slamlib.robust.initialization import odometry_state
 from slamlib.robust.linear import NormalEquations, build_problem, laplace_approximation
@@ -101,3 +102,18 @@ def test_solution_and_evidence_are_those_of_dense_normal_equations(groups, kerne
         log_factors = np.log([other.sightings, other.ranges]) @ count
         assert np.isclose(
             found, -(squared + determinant + of_odometry) / 2 - log_factors, atol=1e-5)
+
+
+@pytest.mark.parametrize("groups", [(), ("marker-size",), ("wheel-scale", "tag-offset")])
+def test_the_last_position_is_as_certain_as_dense_normal_equations_say(groups):
+    """For any groups, by one linearisation with all of them released."""
+    m = measure(known_noise(short(4, 300)[0], 1e-3))
+    problem = released(build_problem(m, "arc", Noise(1e-3)), groups)
+    state = odometry_state(m, "arc")
+    sums = NormalEquations(problem, state).sums(problem.noise)
+    last = m.structure.rows[len(m.frame) - 1, :2]
+    expected = np.linalg.inv(dense_information(m.structure, sums))[last, last].sum()
+    likelihood = choices._likelihood(SimpleNamespace(problem=problem, state=state))
+    root = choices._in_wide_sigmas(m.calibration, likelihood.L, problem.prior.root)
+    assert choices._posterior(likelihood, root)[2] == pytest.approx(expected, rel=1e-4)
+    assert expected > 1.1 * likelihood.variance

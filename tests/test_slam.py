@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numeric import (
+    aligned_ate,
     aruco,
     as_points,
     assert_consistent,
@@ -276,6 +277,16 @@ def test_a_delay_at_a_corner_is_no_jump(monkeypatch):
     found = estimate(replace(vehicle(sighting_lag=6.0)(dataset), uwb=None))
     assert [doubt.what for doubt in solution_doubts(found)] == ["time-offset"]
     assert mean_nees(found, truth) < 8
+
+
+def test_what_is_not_told_does_not_cost_metres(monkeypatch):
+    """A camera elsewhere looks like a wheelbase, by which the end would be 2.6 m off."""
+    drive_along([(30, 0), (0.8, np.pi / 2), (40, 0)], monkeypatch, aruco_every=24,
+                marker_spacing=1.5)
+    dataset, truth = simulation.simulate("way", 7126, slip=8e-3)
+    found = estimate(replace(vehicle(camera_x=0.15)(dataset), uwb=None))
+    assert not found.released
+    assert mean_nees(found, truth) < 6 and aligned_ate(found, truth) < 0.5
 
 
 def test_derivatives_have_expected_turns_but_those_of_corners_as_counted():

@@ -63,6 +63,7 @@ POSITIVE = np.r_[WHEELS, SIZE, SCALE]    # entries of the calibration that are a
 MAX_RATIO = 2.5              # of these over what is stated, or the reverse
 MIN_INFORMATION = 1e-3       # about an entry, in wide sigmas, below which it is not considered
 MAX_PROPOSALS = 5            # number of sets that are solved
+MAX_COST = 1.5               # ratio of sigmas of the last position, by what is released untold
 MIN_JUMP_LEAD = 10.0         # log evidence by which a jump found at the solution is believed
 
 PLAUSIBLE_FACTOR = 2.0       # on standard deviations, beyond which a sensor is not believed slow
@@ -259,6 +260,7 @@ class _Sets(NamedTuple):
     merit: np.ndarray            # (s,) log evidence less the prices of the groups
     surprise: np.ndarray         # (s,) part of the prices, of groups that are stated in full
     furthest: np.ndarray         # (s,) largest posterior mean of what is released, in its sigmas
+    variance: np.ndarray         # (s,) m^2, of the last position
 
 
 def _proposal(fit):
@@ -266,13 +268,14 @@ def _proposal(fit):
 
     `explanations` are the best set of groups and others that the drive cannot tell from it, neither
     part of it nor more. The prior releases all their groups, and what else raises the evidence: not
-    certain enough to be told, but the covariances include it. Wide standard deviations are
-    multiplied by GROSS if an entry that is released would be further off than MAX_WIDE_SIGMAS.
+    certain enough to be told, but the covariances include it, unless the last position would be far
+    less certain. Wide standard deviations are multiplied by GROSS if an entry that is released
+    would be further off than MAX_WIDE_SIGMAS.
     """
     calibration = fit.problem.measurements.calibration
-    L, h = _likelihood(fit)
+    likelihood = _likelihood(fit)
     for width in (1.0, GROSS):
-        sets = _sets(calibration, L, h, width)
+        sets = _sets(calibration, likelihood, width)
         k = int(sets.merit.argmax())
         best = sets.groups[k]
         if not best or sets.furthest[k] < MAX_WIDE_SIGMAS:
@@ -280,7 +283,8 @@ def _proposal(fit):
     told = _as_likely(sets, k)
     explanations = tuple(some for some in told if not (some < best or some > best))
     k = _released_set(sets, certain=frozenset().union(*told), default=k)
-    present = _log_evidence(L, h, _in_wide_sigmas(calibration, L, fit.problem.prior.root))[0]
+    root = _in_wide_sigmas(calibration, likelihood.L, fit.problem.prior.root)
+    present = _posterior(likelihood, root)[0]
     return _Proposal(explanations, sets.priors[k], sets.evidence[k] - present)
 
 
@@ -289,18 +293,19 @@ def _lead_of_group(fit, group):
     calibration = fit.problem.measurements.calibration
     prior = fit.problem.prior
     without = calibration.prior(prior.groups - {group}, prior.width)
-    L, h = _likelihood(fit)
-    roots = _in_wide_sigmas(calibration, L, np.stack([prior.root, without.root]))
-    of_all, of_others = _log_evidence(L, h, roots)[0]
+    likelihood = _likelihood(fit)
+    roots = _in_wide_sigmas(calibration, likelihood.L, np.stack([prior.root, without.root]))
+    of_all, of_others = _posterior(likelihood, roots)[0]
     log.info("calibration: log evidence %+.1f by %s", of_all - of_others, group)
     return of_all - of_others
 
 
-def _sets(calibration, L, h, width):
-    """The _Sets of up to MAX_GROUPS groups of which the likelihood of L (p, p), h (p,) tells.
+def _sets(calibration, likelihood, width):
+    """The _Sets of up to MAX_GROUPS groups of which a _Likelihood tells.
 
     Their wide standard deviations are multiplied by a width.
     """
+    L = likelihood.L
     doubtful = (np.diag(L) > 0) & (calibration.wide > calibration.sigma)
     groups = np.unique(calibration.group[doubtful]).tolist()
     if doubtful[RADII].all():
@@ -311,13 +316,14 @@ def _sets(calibration, L, h, width):
     given = np.array([prior.root for prior in priors])
     is_released = np.diagonal(given, axis1=1, axis2=2) > calibration.sigma
     roots = _in_wide_sigmas(calibration, L, given)
-    evidence, mean = _log_evidence(L, h, roots)
+    evidence, mean, variance = _posterior(likelihood, roots)
     price = {group: _price(calibration, group) for group in groups}
     surprise = {group: _surprise(calibration, group) for group in groups}
     prices = np.array([sum(price[group] for group in some) for some in sets])
     surprises = np.array([sum(surprise[group] for group in some) for some in sets])
     return _Sets(sets, priors, evidence, evidence - prices, surprises,
-                 furthest=np.max(np.abs(mean), axis=1, where=is_released, initial=0.0))
+                 furthest=np.max(np.abs(mean), axis=1, where=is_released, initial=0.0),
+                 variance=variance)
 
 
 def _as_likely(sets, best):
@@ -343,10 +349,17 @@ def _in_wide_sigmas(calibration, L, roots):
 
 
 def _released_set(sets, certain, default):
-    """Number of the most probable of the _Sets that hold `certain`, the `default` if none does."""
+    """Number of the most probable of the _Sets that hold `certain`, the `default` if none does.
+
+    What it releases beside them raises the sigma of the last position by MAX_COST at most.
+    """
     holding = [k for k, some in enumerate(sets.groups) if certain <= some]
+    if not holding:
+        return default
+    largest = MAX_COST**2 * sets.variance[holding].min()
+    affordable = [k for k in holding if sets.variance[k] <= largest]
     probable = sets.evidence - sets.surprise
-    return max(holding, key=probable.item, default=default)
+    return max(affordable, key=probable.item)
 
 
 def _price(calibration, group):
@@ -362,38 +375,60 @@ def _surprise(calibration, group):
     return STATED * calibration.sigma[calibration.of_group(group)].all()
 
 
-def _log_evidence(L, h, root):
-    """Log evidences (...) of priors with roots (..., p, p), as of a Prior.
+class _Likelihood(NamedTuple):
+    """The likelihood of the calibration, in wide sigmas from what is stated, all else eliminated.
 
-    From the information L (p, p) and h (p,) of the likelihood. Also the posterior means (..., p) of
-    the unknowns, in their standard deviations, in which the equations are solved.
+    exp(-u^T L u / 2 + h^T u), and the last position for a known calibration.
     """
+
+    L: np.ndarray            # (p, p)
+    h: np.ndarray            # (p,)
+    variance: float          # m^2, of the last position
+    lever: np.ndarray        # (2, p) m, its derivatives by u
+
+
+def _posterior(likelihood, root):
+    """What priors with roots (..., p, p), as of a Prior, make of a _Likelihood.
+
+    Log evidences (...), means (..., p) of the unknowns, in their standard deviations, in which the
+    equations are solved, and variances (...) of the last position.
+    """
+    L, h, variance, lever = likelihood
     information = np.eye(len(h)) + root.mT @ L @ root
     gradient = h @ root
     mean = np.linalg.solve(information, gradient[..., None])[..., 0]
     log_determinant = np.linalg.slogdet(information).logabsdet
     evidence = np.sum(gradient * mean, axis=-1) / 2 - log_determinant / 2
-    return evidence, mean
+    moved = (lever @ root).mT
+    added = np.sum(moved * np.linalg.solve(information, moved), axis=(-2, -1))
+    return evidence, mean, variance + added
 
 
 def _likelihood(fit):
-    """Information L (p, p) and h (p,) about the calibration, in wide sigmas from what is stated."""
+    """The _Likelihood of the calibration of a Fit."""
     calibration = fit.problem.measurements.calibration
     wide = Prior(frozenset(), 1.0, np.diag(calibration.wide))
     equations = NormalEquations(replace(fit.problem, prior=wide), fit.state)
     sums = equations.sums(fit.problem.noise, consistent=True)
     solution = linear_solution(equations.structure, sums)
     u = (fit.state.c - calibration.stated) / calibration.wide
-    L = np.zeros((len(u), len(u)))
+    p = len(u)
+    L = np.zeros((p, p))
     if solution is None:
-        return L, np.zeros(len(u))
-    without_prior = solution.S - np.eye(len(u))
+        return _Likelihood(L, np.zeros(p), 0.0, np.zeros((2, p)))
+    without_prior = solution.S - np.eye(p)
     gradient = solution.gradient - u                      # without the prior, too
     known = np.diag(without_prior) > MIN_INFORMATION
     block = np.ix_(known, known)
     values, axes = np.linalg.eigh(without_prior[block])
     L[block] = axes * np.maximum(values, 0) @ axes.T
-    return L, np.where(known, L @ u - gradient, 0.0)
+    position = equations.structure.rows[len(fit.state.poses) - 1, :2]
+    B = sums.border[:-p, :-1]
+    selected = np.zeros((len(B), 2))
+    selected[position] = np.eye(2)
+    covariance = solution.solve(selected)
+    return _Likelihood(L, np.where(known, L @ u - gradient, 0.0),
+                       variance=np.trace(covariance[position]), lever=-covariance.T @ B)
 
 
 def _lead(proposed, present):

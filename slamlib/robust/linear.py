@@ -11,6 +11,7 @@ and ranges. The group of odometry depends on the slip, those of sightings and ra
 noise factors. Each value of the noise then costs one decomposition, which gives its evidence.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from operator import attrgetter
@@ -138,6 +139,7 @@ class LinearSolution:
     gradient: np.ndarray     # (q,) by the calibration, the other unknowns eliminated
     log_determinant: float   # of the information matrix
     decrease: float          # of half the squared error, by the step
+    solve: Callable[[np.ndarray], np.ndarray]    # H^-1 times (n, k)
 
 
 @dataclass(frozen=True)
@@ -292,7 +294,8 @@ def linear_solution(structure: Structure, sums: Sums) -> LinearSolution | None:
     return LinearSolution(
         delta=delta, S=S, gradient=gradient,
         log_determinant=determinant.logabsdet + np.sum(np.log(pivots)),
-        decrease=-(sums.border[:, -1] @ delta) / 2)
+        decrease=-(sums.border[:, -1] @ delta) / 2,
+        solve=lu.solve)
 
 
 def laplace_approximation(equations: NormalEquations, noise: Noise) -> tuple[np.ndarray, float]:
