@@ -55,6 +55,7 @@ DECISIVE_LEAD = 3.0          # log evidence by which another model of the steps 
 DECISIVE_RELEASE = 6.0       # log evidence by which a group is told to be wrong
 FURTHER_ENTRY = 0.5          # log evidence beside it, for each entry of a group but the first
 STATED = 3.0                 # log evidence beside it, if standard deviations are stated
+ANY_MOMENT = 6.0             # log evidence beside it, for what happens at one of hundreds of moments
 AMBIGUOUS = 3.0              # log evidence within which explanations cannot be told apart
 MAX_GROUPS = 5               # number of groups that are wrong at once
 MAX_WIDE_SIGMAS = 4.0        # wide sigmas, of an entry; beyond them a statement is grossly wrong
@@ -367,6 +368,7 @@ def _price(calibration, group):
     entries = calibration.of_group(group)
     count = 1 if group == WHEEL_SCALE else np.count_nonzero(entries)
     price = DECISIVE_RELEASE + FURTHER_ENTRY * (count - 1)
+    price += ANY_MOMENT * (group == "camera-bump")
     return price + STATED * calibration.sigma[entries].any()
 
 
