@@ -485,8 +485,11 @@ def most_consistent(
                 spares_sightings, explanation="places of ids", least=MIN_SPARED * count)
             if are_needed(_alternative(start, fit, no_jumps, places), fit):
                 with_places = decide(start(no_jumps, places))
-                fit = _alternative(start, with_places, no_jumps)
-                if fit is None or are_needed(with_places, fit):
+                without = _alternative(start, with_places, no_jumps)
+                if without is None:
+                    return with_places, places
+                fit = decide(without)
+                if are_needed(with_places, fit):
                     return with_places, places
     jumps = with_stretched(fit)
     if jumps is not None and _lead_of_jumps(_alternative(start, fit, jumps), fit) > MIN_JUMP_LEAD:

@@ -118,7 +118,8 @@ def linearize_odometry(problem, state, slip: float) -> LinearizedFactors:
     U = _odometry_roots(problem.odometry, slip)
     factors = _whitened(problem, np.arange(len(e)), WHEELS, U, e, J, by_wheel)
     roots = count_scale(problem.odometry, state.c[WHEELS]) * np.linalg.diagonal(U)
-    return replace(factors, log_determinant=-2 * np.sum(np.log(roots)))
+    size = np.abs(roots)                     # a step on the way may make a radius negative
+    return replace(factors, log_determinant=-2 * np.sum(np.log(size)))
 
 
 @lru_cache(maxsize=4)

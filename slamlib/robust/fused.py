@@ -240,12 +240,12 @@ def _learned_models(dataset, jumps, slip):
     First of filters that estimate the camera, then of those with its stated pose, memory and factor
     as of the first.
     """
-    slips = SLIPS if slip is None else [slip]
+    tried = SLIPS if slip is None else [slip]
     factors = FACTORS if dataset.vehicle.marker_noise_factor is None else [1.0]
     stretches = _stretches(dataset)
 
     def likeliest(memories, elsewhere, factors):
-        models = _all_models(slips, memories, [elsewhere], factors)
+        models = _all_models(tried, memories, [elsewhere], factors)
         densities = _log_densities(stretches, jumps, models)
         best = densities.argmax()
         return densities[best], _Models(*[field[best] for field in models])
@@ -254,6 +254,7 @@ def _learned_models(dataset, jumps, slip):
     density_as_stated, as_stated = likeliest([best.memory], False, [best.factor])
     if density_as_stated >= density:
         best = as_stated
+    slips = tried
     if slip is None:
         are_poor = best.memory > 0 or best.factor > 1    # errors of the sightings
         least = TYPICAL_SLIP if are_poor else SLIP_BOUNDS[0]
