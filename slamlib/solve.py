@@ -26,6 +26,7 @@ from slamlib.core.errors import DatasetError, require
 from slamlib.core.records import NO_RANGES, NO_SIGHTINGS, Dataset, Truth
 from slamlib.io import files, results
 from slamlib.io.dataset import read_dataset, read_truth, write_vehicle
+from slamlib.io.formats import ENCODER
 from slamlib.robust.file_doubts import Doubt, doubts_before_solving, merged
 from slamlib.robust.result import SlamResult
 from slamlib.robust.solution_doubts import (
@@ -252,7 +253,8 @@ def write_results(out: Path | str, problem: str, found, dataset: Dataset,
     Returns
     -------
     The Solution that is written, whose `doubts` say what contradicts the files, or the Failure by
-    an exception. Raises UNSOLVABLE if a covariance is lost by rounding.
+    an exception. Raises UNSOLVABLE if a covariance is lost by rounding, and DatasetError if `out`
+    is the folder of a dataset.
 
     >>> from slamlib.studies.simulation import simulate
     >>> dataset, truth = simulate("short", seed=1)
@@ -263,6 +265,8 @@ def write_results(out: Path | str, problem: str, found, dataset: Dataset,
     2000
     """
     out = Path(out)
+    require(not (out / ENCODER).exists(), out,
+            "another folder for the results: this one is a dataset's")
     if isinstance(found, Exception):
         solution = _failure(problem, dataset, found)
     else:

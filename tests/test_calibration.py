@@ -135,7 +135,8 @@ def test_what_a_drive_cannot_tell_apart_by_hand(monkeypatch, off, sigma, named):
 
 
 @pytest.mark.parametrize("h, variance, released", [
-    (1.0, 1.0, set()), (2.0, 1.0, {"marker-size"}), (2.0, 7e-3, {"marker-size"}), (2.0, 6e-3, set())])
+    (1.0, 1.0, set()), (2.0, 1.0, {"marker-size"}), (2.0, 7e-3, {"marker-size"}),
+    (2.0, 6e-3, set())])
 def test_what_raises_the_evidence_is_released_also_if_it_is_not_told(
         monkeypatch, h, variance, released):
     """L = 1.5 in the size: evidence h^2 / 5 - log(2.5) / 2, above 0 from h = 1.51 on.

@@ -122,7 +122,7 @@ def test_doubts_notes_and_failures_are_in_the_readme():
         summary["problems"][problem] = {"title": problem, "failed": reason}
     text = " ".join(handin.readme([summary], Options(author="A", course="C")).split())
     for part in ("d: Lengths are in mm.", "d: A header was left out.",
-                 "d/problem2 (ArUco) is not here: it needs markers.",
+                 "d/problem2 (ArUco) is not here: it needs markers, and its chapter in the report.",
                  "d/problem3 (problem3) could not be solved: no landmark.",
                  "d/problem2_hint (problem2_hint) could not be solved: not told.",
                  "/problem4 (SLAM with UWB ranges) is not here: it needs UWB ranges to antennas"):

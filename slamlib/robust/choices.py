@@ -55,7 +55,7 @@ DECISIVE_LEAD = 3.0          # log evidence by which another model of the steps 
 DECISIVE_RELEASE = 6.0       # log evidence by which a group is told to be wrong
 FURTHER_ENTRY = 0.5          # log evidence beside it, for each entry of a group but the first
 STATED = 3.0                 # log evidence beside it, if standard deviations are stated
-ANY_MOMENT = 6.0             # log evidence beside it, for what happens at one of hundreds of moments
+ANY_MOMENT = 6.0             # log evidence beside it, for what may happen at any moment
 AMBIGUOUS = 3.0              # log evidence within which explanations cannot be told apart
 MAX_GROUPS = 5               # number of groups that are wrong at once
 MAX_WIDE_SIGMAS = 4.0        # wide sigmas, of an entry; beyond them a statement is grossly wrong
@@ -246,10 +246,17 @@ def _released(fit, proposal):
 
 
 def _is_solved(fit):
-    """Whether the rounds of a Fit ended, with wheels and scales within MAX_RATIO of the stated."""
-    stated = fit.problem.measurements.calibration.stated
-    ratio = fit.state.c[POSITIVE] / stated[POSITIVE]
-    return fit.converged and ratio.min() > 1 / MAX_RATIO and ratio.max() < MAX_RATIO
+    """Whether the rounds of a Fit ended, with a possible calibration."""
+    is_possible = _is_possible(fit.problem.measurements.calibration, fit.state.c)
+    return fit.converged and is_possible.all()
+
+
+def _is_possible(calibration, c):
+    """Which entries of c (..., p) can be: wheels and scales, within MAX_RATIO of the stated."""
+    found = np.ones(c.shape, bool)
+    ratio = c[..., POSITIVE] / calibration.stated[POSITIVE]
+    found[..., POSITIVE] = (ratio > 1 / MAX_RATIO) & (ratio < MAX_RATIO)
+    return found
 
 
 class _Sets(NamedTuple):
@@ -257,7 +264,7 @@ class _Sets(NamedTuple):
 
     groups: list[frozenset]      # (s,)
     priors: list[Prior]          # (s,)
-    evidence: np.ndarray         # (s,) log evidence
+    evidence: np.ndarray         # (s,) log evidence, -inf where what is released cannot be
     merit: np.ndarray            # (s,) log evidence less the prices of the groups
     surprise: np.ndarray         # (s,) part of the prices, of groups that are stated in full
     furthest: np.ndarray         # (s,) largest posterior mean of what is released, in its sigmas
@@ -318,6 +325,9 @@ def _sets(calibration, likelihood, width):
     is_released = np.diagonal(given, axis1=1, axis2=2) > calibration.sigma
     roots = _in_wide_sigmas(calibration, L, given)
     evidence, mean, variance = _posterior(likelihood, roots)
+    c = calibration.stated + np.matvec(given, mean)
+    impossible = is_released & ~_is_possible(calibration, c)
+    evidence[impossible.any(axis=1)] = -np.inf
     price = {group: _price(calibration, group) for group in groups}
     surprise = {group: _surprise(calibration, group) for group in groups}
     prices = np.array([sum(price[group] for group in some) for some in sets])

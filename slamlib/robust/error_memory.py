@@ -27,8 +27,8 @@ import numpy as np
 
 MAX_LAG = 100                # number of typical intervals over which errors are compared
 MAX_PAUSE = 10               # of these, without a measurement, after which errors are independent
-MIN_CORRELATION = 0.1        # of neighbours' residuals, below which errors are independent
-MIN_SIGNIFICANCE = 5.0       # of its standard deviations, the same
+MIN_CORRELATION = 0.05       # of neighbours' residuals, below which errors are independent
+MIN_SIGNIFICANCE = 4.0       # of its standard deviations, the same
 MIN_RHO = 0.05               # below which errors are independent from that lag on
 MIN_VARIANCE = 0.01          # of residuals in their sigmas; smaller ones are no errors of sensors
 MIN_PAIRS = 30               # number of pairs at a lag, below which it is left out

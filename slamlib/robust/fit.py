@@ -27,7 +27,7 @@ from slamlib.robust.measurements import (
     accept_all,
     with_known,
 )
-from slamlib.robust.noise import NoisePosterior, learn_noise, with_hidden_errors
+from slamlib.robust.noise import NoisePosterior, learn_noise, with_least_slip
 from slamlib.robust.optimize import optimize
 
 log = logging.getLogger(__name__)
@@ -193,7 +193,7 @@ def refine(problem: Problem, state: State,
     accepted = with_memory(fit.problem, fit.state)
     if not (accepted.share < 1).any():
         return fit
-    problem = _with_hidden_errors(replace(fit.problem, accepted=accepted))
+    problem = _with_least_slip(replace(fit.problem, accepted=accepted))
     return _fit(problem, optimize(problem, fit.state), fit.posterior)
 
 
@@ -210,7 +210,7 @@ def _settled_fit(problem, state, accept):
         problem = _relinearized(replace(problem, accepted=accepted), state)
         if m.learned.any() and not is_settled:
             problem, state, posterior = _settle_noise(problem, state)
-        problem = _with_hidden_errors(problem)
+        problem = _with_least_slip(problem)
         optimum = optimize(problem, state)
         state = optimum.state
         accepted = accept(replace(problem, reference=state.c), state)
@@ -275,7 +275,7 @@ def settled(fit: Fit) -> Fit:
     """
     problem = fit.problem
     if fit.posterior is not None:
-        problem = replace(problem, noise=_with_hidden(problem, fit.posterior.mean))
+        problem = _with_least_slip(replace(problem, noise=fit.posterior.mean))
     state = fit.state
     for _ in range(MAX_ROUNDS):
         optimum = optimize(problem, state)
@@ -288,31 +288,14 @@ def settled(fit: Fit) -> Fit:
 
 
 def _accepted_with_memory(problem, state, accept):
-    """The AcceptedMeasurements with the shares that memory leaves of their information.
-
-    For standard deviations that include what residuals do not show.
-    """
-    noise = with_hidden_errors(problem.noise, (True, True), problem.measurements.dataset.vehicle)
-    hidden = replace(problem, noise=noise)
-    hidden = replace(hidden, accepted=accept(hidden, state))
-    shares = [memory.share for memory in error_memories(hidden, state)]
-    remember = _remember(shares)
-    if any(remember):
-        noise = with_hidden_errors(problem.noise, remember, problem.measurements.dataset.vehicle)
-    return accept(replace(problem, noise=noise), state).with_shares(shares)
+    """The AcceptedMeasurements with the shares that memory leaves of their information."""
+    accepted = accept(problem, state)
+    memories = error_memories(replace(problem, accepted=accepted), state)
+    return accepted.with_shares(memory.share for memory in memories)
 
 
-def _remember(shares):
-    """Whether the errors of sightings, and those of ranges, have memory, by shares (s,), (r,)."""
-    return [bool((share < 1).any()) for share in shares]
-
-
-def _with_hidden_errors(problem):
-    """The Problem whose noise includes hidden errors of what has memory."""
-    return replace(problem, noise=_with_hidden(problem, problem.noise))
-
-
-def _with_hidden(problem, noise):
-    """A Noise with hidden errors of what has memory in a Problem."""
-    remember = _remember([kind.share for kind in problem.accepted])
-    return with_hidden_errors(noise, remember, problem.measurements.dataset.vehicle)
+def _with_least_slip(problem):
+    """The Problem with the typical slip at least, if errors of its measurements have memory."""
+    remember = any((kind.share < 1).any() for kind in problem.accepted)
+    vehicle = problem.measurements.dataset.vehicle
+    return replace(problem, noise=with_least_slip(problem.noise, remember, vehicle))

@@ -45,6 +45,7 @@ from slamlib.core.hint import Fusion
 from slamlib.core.increments import SLIP_BOUNDS, SLIP_FACTOR, TYPICAL_SLIP
 from slamlib.core.records import NO_SIGHTINGS, Dataset
 from slamlib.core.sightings import GATE, sightings_by_frame
+from slamlib.core.vehicle import changed
 from slamlib.robust.calibration import stated_calibration
 from slamlib.robust.error_memory import MAX_PAUSE
 from slamlib.robust.jumps import NO_JUMPS, Jumps, crawls, creep_covariance, find_jumps
@@ -141,7 +142,7 @@ def fuse(dataset: Dataset, slip: float | None = None) -> LearnedFusion:
     of the dataset's Vehicle or, if it has none, what the innovations say of it. A
     marker_noise_factor of the Vehicle multiplies the standard deviations of the sightings.
     Increments are exact arcs. Without markers the result is the first-order propagation of odometry
-    with the noise of slip.
+    with the noise of slip. Raises DatasetError for a slip beyond its limits.
 
     >>> from slamlib.studies.simulation import simulate
     >>> dataset, truth = simulate("short", seed=1)
@@ -149,9 +150,11 @@ def fuse(dataset: Dataset, slip: float | None = None) -> LearnedFusion:
     (2000, 3)
     """
     require(isinstance(dataset, Dataset), "fuse", "a Dataset", dataset)
+    vehicle = changed(dataset.vehicle, {"slip": slip}, "fuse")
+    if vehicle != dataset.vehicle:                       # of the same Dataset jumps are known
+        dataset = replace(dataset, vehicle=vehicle)
     dataset = _with_delay_mended(with_wheels_mended(dataset))
-    if slip is None:
-        slip = dataset.vehicle.slip
+    slip = dataset.vehicle.slip
     dataset = _with_camera_mended(dataset, slip or TYPICAL_SLIP)
     jumps = _believed_jumps(dataset, slip or TYPICAL_SLIP)
     models = _learned_models(dataset, jumps, slip)

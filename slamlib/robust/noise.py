@@ -8,7 +8,6 @@ is uncertain.
 """
 
 import logging
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import combinations
@@ -35,25 +34,18 @@ CONVERGED_GAIN = 0.01        # log posterior gained by Newton's last step, besid
 SINGULAR = -1e12             # log evidence of noise for which the equations are singular
 
 POOR_FACTOR = 1.5            # of sightings, above which errors may be shared
-HIDDEN_RATIO = 2.0           # largest ratio of errors with memory to what residuals show of them
 
 
-def with_hidden_errors(noise: Noise, remember: Sequence[bool], vehicle: Vehicle) -> Noise:
-    """The Noise with what residuals do not show of errors with memory.
+def with_least_slip(noise: Noise, remember: bool, vehicle: Vehicle) -> Noise:
+    """The Noise with the typical slip at least, if errors of a kind `remember` earlier ones.
 
-    The factors of sightings and of ranges, where their errors `remember` (2,), are at least 1, but
-    at most HIDDEN_RATIO times the learned ones. Slow errors are smoother than the shares of their
-    information say, which makes the slip look small, and so do errors that all markers of an image
-    share, for which their factor is large: then it is at least the typical one. What a Vehicle
-    gives stays.
+    Slow errors are smoother than the shares of their information say, which makes the slip look
+    small, and so do errors that all markers of an image share, for which the factor of the
+    sightings is large. A slip that a Vehicle gives stays.
     """
-    learned = np.array([noise.sightings, noise.ranges])
-    enlarged = np.maximum(learned, np.minimum(1.0, HIDDEN_RATIO * learned))
-    factors = np.where(remember, enlarged, learned)
-    slip = noise.slip
-    if any(remember) or noise.sightings > POOR_FACTOR:
-        slip = max(slip, TYPICAL_SLIP)
-    return with_known(Noise(slip, *factors.tolist()), vehicle)
+    if remember or noise.sightings > POOR_FACTOR:
+        noise = noise._replace(slip=max(noise.slip, TYPICAL_SLIP))
+    return with_known(noise, vehicle)
 
 
 @dataclass(frozen=True)

@@ -86,13 +86,12 @@ def _calibration_doubts(result):
         return max(map(sigmas_off, rows[group]))
 
     furthest = max(either, key=distance, default=None)
-    problem = "problem 4" if len(result.antenna) else "problem 3"
     for group, (_, advice) in GROUPS.items():
         if group not in common and group != furthest:
             continue
         off = [row for row in rows[group] if sigmas_off(row) > MIN_TOLD_SIGMAS]
         numbers = " and ".join(map(_estimated_and_stated, off or rows[group]))
-        sentence = f"By the drive {numbers}; {problem} uses this."
+        sentence = f"By the drive {numbers}; {_problem(result)} uses this."
         if group == "camera-bump":
             sentence = f"From pose {result.jumps.bump + 1} on the camera is elsewhere. {sentence}"
         if group == furthest:
@@ -100,6 +99,11 @@ def _calibration_doubts(result):
             sentence += (f" It may instead be {' or '.join(others)}: the drive cannot tell, and "
                          "the covariances include it.")
         yield Doubt(group, sentence, advice)
+
+
+def _problem(result):
+    """The problem whose result it is, in words."""
+    return "problem 4" if len(result.antenna) else "problem 3"
 
 
 def _estimated_and_stated(row):
@@ -183,9 +187,9 @@ def _memory_doubt(result, kind, share):
     correlation = result.correlation[kind.column - 1]
     return Doubt(f"{kind.doubt}-memory", (
         f"Errors of successive {kind.name} are alike: the correlation of their residuals is "
-        f"{correlation:.2f}. So problems 3 and 4 count {len(share)} {kind.name} as "
+        f"{correlation:.2f}. So {_problem(result)} counts {len(share)} {kind.name} as "
         f"{share.sum():.0f}, with {result.noise[kind.column]:.2g} times the standard deviations in "
-        f"{kind.file}, because residuals do not show all of such errors."), (
+        f"{kind.file}."), (
         "Look at the calibration of the sensor, and for what blurs, hides or reflects."))
 
 
@@ -197,8 +201,7 @@ def _factor_doubt(result, kind):
     if sigma == 0 or abs(np.log(factor)) <= least:
         return
     sentence = (f"The {kind.name} scatter {factor:.2f} ± {factor * sigma:.2f} times as much as "
-                f"{kind.file} states: problems 3 and 4 use the scatter that was found, the others "
-                "the file's.")
+                f"{kind.file} states: {_problem(result)} uses the scatter that was found.")
     if kind == SIGHTINGS and _are_sigmas(result, factor):
         sentence += " So they would if its columns of variances held standard deviations."
     if kind == RANGES:
@@ -227,7 +230,7 @@ def _place_doubts(result):
     ids, places = result.places[result.places[:, 0] != result.places[:, 1]].T
     yield Doubt("places", (
         f"By the path between their sightings, markers {_listed(ids)} were seen at more than one "
-        f"place: problems 3 and 4 have the others as markers {_listed(places)}."), (
+        f"place: {_problem(result)} has the others as markers {_listed(places)}."), (
         "Look for ids that are used twice, for markers that were moved, and whether the vehicle "
         "was carried where it saw none."))
 
@@ -295,7 +298,8 @@ def _slip_doubt(slip):
             "deviation) after one metre, far more than wheels do: problem 2's fusion may follow "
             "errors of the sightings, with too small covariances."), (
             "Look whether encoderReading.txt is of the same drive as the other files, with the "
-            "same pose ids, and at the standard deviations in ArucoReading.txt."))
+            "same pose ids, and at the standard deviations in ArucoReading.txt. The rounding of "
+            "counts that are centimetres apart looks the same."))
 
 
 def _path_doubts(result):
@@ -303,8 +307,8 @@ def _path_doubts(result):
     if result.fit.problem.is_shaken:
         yield Doubt("camera-shakes", (
             "Errors of all markers of an image are alike. They move the path to and fro as a large "
-            "slip would, but do not accumulate as slip does: problems 3 and 4 take the slip to be "
-            f"{1e3 * result.slip:.0f} mm (one standard deviation) after one metre."), (
+            f"slip would, but do not accumulate as slip does: {_problem(result)} takes the slip to "
+            f"be {1e3 * result.slip:.0f} mm (one standard deviation) after one metre."), (
             "Look whether the camera tilts or shakes while the vehicle moves, and state the slip "
             "in vehicle.toml."))
     if result.noise_sigma[0]:
