@@ -148,6 +148,14 @@ def test_what_raises_the_evidence_is_released_also_if_it_is_not_told(
     assert found.explanations == (frozenset(),) and found.prior.groups == released
 
 
+@pytest.mark.parametrize("times, groups", [(2.0, {"marker-size"}), (3.0, set())])
+def test_what_cannot_be_is_not_proposed(monkeypatch, times, groups):
+    """L = 100 in the size, which would be twice, or three times, what is stated."""
+    off = (times - 1) / 0.05                             # wide sigmas
+    found = proposed(monkeypatch, Vehicle(), [SIZE], 100, 100 * off)
+    assert found.explanations == (frozenset(groups),) and found.prior.groups == groups
+
+
 # The drive of a seed as sensors elsewhere would have logged it, with the same noise.
 
 def ranged_from(dataset, truth, tag=(0.0, 0.0), height=0.0, offsets=(0, 0, 0, 0), late=0):

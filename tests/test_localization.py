@@ -51,6 +51,12 @@ def test_a_delay_that_nobody_stated_costs_the_fusion_nothing():
     assert ate(fuse(late).poses, truth.poses, aligned=True) < 0.02
 
 
+@pytest.mark.parametrize("slip", [-1.0, 1.0, float("nan"), "a"])
+def test_a_slip_that_cannot_be_is_refused(slip):
+    with pytest.raises(DatasetError, match="fuse: expected a number from 0 to 0.1 .* for slip"):
+        fuse(short(1, 100)[0], slip)
+
+
 def test_perfect_data_give_the_exact_poses_map_and_wheels():
     dataset, truth = short(1, 1000, noise=False)
     for each in (fuse(dataset, slip=1e-3), fuse(dataset)):

@@ -64,6 +64,16 @@ def test_memory_is_told_and_counted():
     assert f"counts {len(result.share)} sightings as {result.share.sum():.0f}" in sentence
 
 
+def test_slow_errors_are_not_as_large_as_stated_if_they_are_smaller():
+    """Three times their standard deviations are in the file; the path is nearly as right."""
+    dataset, truth = short(3, memory=0.9)
+    right = dataset.without("uwb")
+    found = estimate(aruco(right, covariance=9 * right.aruco.covariance))
+    assert 0.3 < found.noise.sightings < 0.7
+    assert aligned_ate(found, truth) < 1.35 * aligned_ate(estimate(right), truth)
+    assert mean_nees(found, truth) < 6
+
+
 def test_beside_slow_errors_no_slip_below_the_typical_one_is_believed():
     low = Noise(1e-4, 1.0, 1.0)
     assert with_least_slip(low, True, TABLE_2).slip == 1e-3

@@ -147,6 +147,16 @@ def test_what_a_killed_run_left_is_removed_by_the_next_problem_that_is_written(t
     assert [path.parent.name for path in tmp_path.rglob("*.mat")] == ["problem1"]
 
 
+def test_results_of_a_problem_are_not_written_among_the_files_of_a_drive(tmp_path, drive):
+    """They would replace its vehicle.toml."""
+    folder = tmp_path / "logs"
+    write_dataset(folder, *drive)
+    before = sorted(folder.rglob("*"))
+    with pytest.raises(DatasetError, match="another folder for the results"):
+        solve.write_results(folder, "problem1", solve.find("problem1", drive[0]), drive[0])
+    assert sorted(folder.rglob("*")) == before
+
+
 def test_a_file_that_cannot_be_written_is_named_and_costs_no_earlier_file(
         tmp_path, drive, monkeypatch):
     """As on a full disk. Without summary.json the folder counts as unfinished."""
