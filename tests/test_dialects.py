@@ -160,8 +160,8 @@ a;b¶¶1;3;nan;1¶1;3;2,5;1¶9;3;1,5;1 | 5 | a whole number from 1 to 4 (the row
 wheelbase = 0 | 1 | a number from 0.001 to 20 m for wheelbase, found '0'
 """,
     "vehicle.toml": """
-# a¶wheel_base = 1 | 2 | entries such as 'wheelbase = 0.4', found 'wheel_base'
-[wheelbases]¶x = 1 | 1 | entries such as 'wheelbase = 0.4', found 'wheelbases'
+# a¶wheel_base = 1 | 2 | entries such as 'wheelbase', found 'wheel_base'
+[wheelbases]¶x = 1 | 1 | entries such as 'wheelbase', found 'wheelbases'
 # left_radius¶left_radius = 'wide' | 2 | a number from 0.001 to 2.5 m for left_radius, found 'wide'
 gate = true¶ "left_radius" = [0.1] | 2 | a number from 0.001 to 2.5 m for left_radius, found '[0.1]'
 left_radius = true | 1 | a number from 0.001 to 2.5 m for left_radius, found 'True'
@@ -173,7 +173,7 @@ gate = true¶gate = true |  | TOML such as 'wheelbase = 0.4', found
 left_radius = \0 1 |  | TOML such as 'wheelbase = 0.4', found
 """}
 LONG = [
-    ("encoderReading.txt", "1 0 0\n2 " + "x" * 999, "2", f"found '2 {58 * 'x'}...'"),
+    ("encoderReading.txt", "1 0 0\n2 " + "x" * 999, "2", f"found '2 {118 * 'x'}...'"),
     ("encoderReading.txt", gzip.compress(b"1 0 0\n", mtime=0), "1", "3 numbers"),
     ("vehicle.toml", "left_radius = " + "[" * 5000, "", "TOML")]
 

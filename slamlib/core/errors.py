@@ -13,8 +13,8 @@ def require(ok: bool, source: str, expected: str, found: object = None) -> None:
 
 
 def quoted(value: object) -> str:
-    """The first 60 characters (str) of a value, in quotes."""
+    """The first 120 characters (str) of a value, in quotes."""
     text = str(value)
-    if len(text) > 60:
-        text = text[:60] + "..."
+    if len(text) > 120:
+        text = text[:120] + "..."
     return repr(text)

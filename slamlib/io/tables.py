@@ -64,7 +64,7 @@ class Table:
             return self
         row = np.argmin(ok)
         expected = next(each for each, right in checks.items() if not right[row])
-        found = shorten(" ".join(f"{number:.12g}" for number in self.numbers[row]), 40)
+        found = shorten(" ".join(f"{number:.12g}" for number in self.numbers[row]), 120)
         fault = f"{self.kind} {self.lines[row]}: expected {expected}, found '{found}'"
         dropped = np.count_nonzero(~ok)
         if dropped > most:

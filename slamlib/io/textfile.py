@@ -6,6 +6,7 @@ or `//`. Commas or semicolons between columns, decimal commas and a header line 
 
 import re
 import tomllib
+from difflib import get_close_matches
 from json import detect_encoding
 from pathlib import Path
 
@@ -28,7 +29,8 @@ def read_toml(path: Path, example: str, known) -> tuple[dict, dict]:
         raise DatasetError(f"{path}: expected TOML such as '{example}', found: {failure}") from None
     places = {key: _place(path, text, key) for key in entries}
     for key, place in places.items():
-        require(key in known, place, f"entries such as '{example}'", key)
+        alike = get_close_matches(key, known, 1)
+        require(key in known, place, f"entries such as '{alike[0] if alike else example}'", key)
     return entries, places
 
 
