@@ -13,6 +13,8 @@ errors,
     rho = mean of u u' + 1 - mean of u^2.
 
 Nothing is added for an antenna: what its ranges have in common is an entry of the calibration.
+What is not used for this, such as an echo, keeps as much as the others do on average: it must not
+outweigh them.
 
 The residuals of n independent errors of a landmark correlate by -1/n without their mean, so (1 -
 correlation) / n is added to the correlation of neighbours, by which memory is recognised.
@@ -96,6 +98,7 @@ def error_memory(landmark: np.ndarray, pose: np.ndarray, u: np.ndarray,
         with_later = np.bincount(pairs.first, rho_of_pair, len(rows))
         with_earlier = np.bincount(pairs.second, rho_of_pair, len(rows))
         share[rows] = 1 / (1 + with_later + with_earlier)
+        share[~used] = share[rows].mean()
     return Memory(correlation, sigma, share)
 
 
