@@ -45,7 +45,7 @@ from slamlib.robust.measurements import NOISE_KEYS, Noise, measure
 from slamlib.robust.noise import learn_noise
 from slamlib.robust.pipeline import fit_from_odometry
 from slamlib.robust.result import slam_result
-from slamlib.robust.solution_doubts import solution_doubts
+from slamlib.robust.solution_doubts import GROUPS, solution_doubts
 from slamlib.studies import montecarlo, simulation
 
 COUNT = 2 * np.pi * 0.1 / 8000                            # m
@@ -264,8 +264,9 @@ def test_wrong_wheels_on_a_long_way_are_neither_jumps_nor_memory(
     dataset, truth = simulation.simulate("way", seed, slip=3e-3)
     wrong = vehicle(right_radius=radii[0], left_radius=radii[1])(dataset)
     found = estimate(replace(wrong, uwb=None))
-    assert [doubt.what for doubt in solution_doubts(found)] == [group]
-    assert mean_nees(found, truth) < 8 and 2e-3 < found.slip < 4e-3
+    doubt, = solution_doubts(found)              # of what the drive cannot tell apart it names all
+    assert doubt.what == group or f"instead be {GROUPS[group][0]}" in doubt.sentence
+    assert mean_nees(found, truth) < 6 and 2e-3 < found.slip < 4e-3
 
 
 @pytest.mark.slow
