@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slamlib.core import se2
-from slamlib.core.vehicle import Vehicle
+from slamlib.core.vehicle import Vehicle, changed
 
 
 class _Readings:
@@ -103,6 +103,14 @@ class Dataset:
             self.uwb,
             range=(self.uwb.range - stated.range_offset) / stated.range_scale,
             sigma=self.uwb.sigma / stated.range_scale)
+
+    def stating(self, entries: dict, source: str) -> "Dataset":
+        """The Dataset whose Vehicle is `changed` by `entries`; the same one where nothing changes.
+
+        What is kept about a Dataset, such as its jumps, is of this record, not of its values.
+        """
+        vehicle = changed(self.vehicle, entries, source)
+        return self if vehicle == self.vehicle else replace(self, vehicle=vehicle)
 
     def without(self, sensor: str) -> "Dataset":
         """The Dataset without a sensor, "aruco" or "uwb"; the same one where it has none."""

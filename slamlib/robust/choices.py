@@ -11,7 +11,8 @@ wide sigmas. For a prior of precisions P on the entries that are not known, the 
 
 so that one linearisation ranks all sets of groups (score tests: Rao, Proc. Camb. Phil. Soc. 44(1),
 1948). A group that leads decisively is told. One that leads less is released, too, so that the
-covariances include it, if its evidence still leads on the same measurements and weights.
+covariances include it, if its evidence still leads on the same measurements and weights, and the
+last position stays nearly as certain.
 
 A visit is a run of sightings of an id without a long break. Where a solution rejects most sightings
 of a visit, the drive is solved once more with a landmark for every visit, so that only the path
@@ -362,7 +363,8 @@ def _in_wide_sigmas(calibration, L, roots):
 def _released_set(sets, certain, default):
     """Number of the most probable of the _Sets that hold `certain`, the `default` if none does.
 
-    What it releases beside them raises the sigma of the last position by MAX_COST at most.
+    With what it releases beside them the sigma of the last position is at most MAX_COST times as
+    large.
     """
     holding = [k for k, some in enumerate(sets.groups) if certain <= some]
     if not holding:

@@ -45,7 +45,6 @@ from slamlib.core.hint import Fusion
 from slamlib.core.increments import SLIP_BOUNDS, SLIP_FACTOR, TYPICAL_SLIP
 from slamlib.core.records import NO_SIGHTINGS, Dataset
 from slamlib.core.sightings import GATE, sightings_by_frame
-from slamlib.core.vehicle import changed
 from slamlib.robust.calibration import stated_calibration
 from slamlib.robust.error_memory import MAX_PAUSE
 from slamlib.robust.jumps import NO_JUMPS, Jumps, crawls, creep_covariance, find_jumps
@@ -150,9 +149,7 @@ def fuse(dataset: Dataset, slip: float | None = None) -> LearnedFusion:
     (2000, 3)
     """
     require(isinstance(dataset, Dataset), "fuse", "a Dataset", dataset)
-    vehicle = changed(dataset.vehicle, {"slip": slip}, "fuse")
-    if vehicle != dataset.vehicle:                       # of the same Dataset jumps are known
-        dataset = replace(dataset, vehicle=vehicle)
+    dataset = dataset.stating({"slip": slip}, "fuse")
     dataset = _with_delay_mended(with_wheels_mended(dataset))
     slip = dataset.vehicle.slip
     dataset = _with_camera_mended(dataset, slip or TYPICAL_SLIP)

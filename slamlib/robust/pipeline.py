@@ -15,7 +15,6 @@ from slamlib.core.errors import require
 from slamlib.core.graph import require_rows
 from slamlib.core.odometry import MODELS
 from slamlib.core.records import Dataset
-from slamlib.core.vehicle import changed
 from slamlib.robust.calibration import Prior
 from slamlib.robust.choices import (
     better_model,
@@ -83,9 +82,7 @@ def estimate(dataset: Dataset, slip: float | None = None, model: str | None = No
     require(model in (None, *MODELS), "estimate", f"{' or '.join(MODELS)} for model", model)
     options = {"slip": slip, "marker_noise_factor": marker_noise_factor,
                "range_noise_factor": range_noise_factor, "kernel": kernel, "gate": gate}
-    vehicle = changed(dataset.vehicle, options, "estimate")
-    if vehicle != dataset.vehicle:                       # of the same Dataset jumps are known
-        dataset = replace(dataset, vehicle=vehicle)
+    dataset = dataset.stating(options, "estimate")
     log.info("estimate of %s: %d poses", dataset.name, len(dataset.ticks))
 
     def start(jumps=NO_JUMPS, places=None, like=None):
