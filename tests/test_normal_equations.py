@@ -14,8 +14,17 @@ from slamlib.core.errors import DatasetError
 from slamlib.core.kernels import KERNELS
 from slamlib.robust import choices, linear
 from slamlib.robust.calibration import ENTRIES
+from slamlib.robust.factors import linearize_measurements
+from slamlib.robust.fit import residuals
 from slamlib.robust.initialization import odometry_state
-from slamlib.robust.linear import NormalEquations, build_problem, laplace_approximation
+from slamlib.robust.linear import (
+    NormalEquations,
+    build_problem,
+    errors_after,
+    laplace_approximation,
+    posterior_draws,
+    retract,
+)
 from slamlib.robust.measurements import WEAK_SIGMA, Noise, _structure, accept_all, measure
 from slamlib.robust.optimize import optimize
 
@@ -102,6 +111,35 @@ def test_solution_and_evidence_are_those_of_dense_normal_equations(groups, kerne
         log_factors = np.log([other.sightings, other.ranges]) @ count
         assert np.isclose(
             found, -(squared + determinant + of_odometry) / 2 - log_factors, atol=1e-5)
+
+
+def test_draws_have_the_covariance_of_the_posterior():
+    """Whitened by the inverse root of the dense one; a covariance of N draws is off by N^-1/2."""
+    m = measure(known_noise(short(4, 60)[0], 1e-3))
+    problem = released(build_problem(m, "arc", Noise(1e-3)), ("marker-size", "wheel-scale"))
+    equations = NormalEquations(problem, odometry_state(m, "arc"))
+    information = dense_information(m.structure, equations.sums(problem.noise))
+    white = np.linalg.cholesky(information).T @ posterior_draws(equations, 4000)
+    covariance = white @ white.T / 4000
+    assert np.abs(covariance - np.eye(len(covariance))).max() < 5 * np.sqrt(2 / 4000)
+    assert_allclose(posterior_draws(equations, 4000), posterior_draws(equations, 4000))
+
+
+def test_changes_of_errors_by_small_steps_are_those_of_residuals():
+    dataset, _ = short(4, 300)
+    m = measure(dataset)
+    problem = released(build_problem(m, "arc"), GROUPS)
+    state = odometry_state(m, "arc")
+    factors = linearize_measurements(problem, state)
+    steps = 1e-6 * np.random.default_rng(1).standard_normal((len(m.structure.diagonal), 2))
+    steps = np.concatenate([steps, np.full((problem.active.sum(), 2), 1e-5)])
+    for k, step in enumerate(steps.T):
+        moved = residuals(problem, retract(problem, state, step))
+        back = residuals(problem, retract(problem, state, -step))
+        for kind, there, before in zip(factors, moved, back):
+            change = errors_after(kind, m.structure, steps)[:, :, k]
+            numeric = (before - there).reshape(change.shape) / 2       # measured minus expected
+            assert_allclose(change, numeric, atol=1e-4 * np.abs(numeric).max())
 
 
 @pytest.mark.parametrize("groups", [(), ("marker-size",), ("wheel-scale", "tag-offset")])

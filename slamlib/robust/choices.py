@@ -31,13 +31,19 @@ import numpy as np
 
 from slamlib.core import se2
 from slamlib.core.errors import DatasetError
-from slamlib.core.odometry import cumulative
 from slamlib.core.records import ArucoReadings, Dataset
 from slamlib.core.sightings import GATE
 from slamlib.robust.calibration import RADII, SCALE, SIZE, WHEEL_SCALE, WHEELS, Prior
 from slamlib.robust.error_memory import runs
 from slamlib.robust.factors import odometry_error, preintegrate_odometry
-from slamlib.robust.fit import Fit, accepted_measurements, refine, residuals
+from slamlib.robust.fit import (
+    Fit,
+    accepted_measurements,
+    has_memory,
+    refine,
+    refine_without_memory,
+    residuals,
+)
 from slamlib.robust.jumps import UNKNOWN_SIGMA, Jumps, find_jumps
 from slamlib.robust.linear import (
     NormalEquations,
@@ -46,7 +52,7 @@ from slamlib.robust.linear import (
     laplace_approximation,
     linear_solution,
 )
-from slamlib.robust.measurements import AcceptedMeasurements, with_known
+from slamlib.robust.measurements import AcceptedMeasurements
 from slamlib.robust.part_faults import camera_bump
 from slamlib.robust.result import slam_result
 
@@ -68,14 +74,10 @@ MAX_PROPOSALS = 5            # number of sets that are solved
 MAX_COST = 1.5               # ratio of sigmas of the last position, by what is released untold
 MIN_JUMP_LEAD = 10.0         # log evidence by which a jump found at the solution is believed
 
-PLAUSIBLE_FACTOR = 2.0       # on standard deviations, beyond which a sensor is not believed slow
-MIN_SHAKEN_SLIP = 0.01       # sqrt(m), from which on a camera that shakes may be the cause
-SHAKEN_SPAN = 40             # number of increments in a sum that tells slip from shaking
-MIN_SHAKEN_SPANS = 3         # of these, on which it is judged
-MAX_VARIANCE_RATIO = 0.35    # of the sum, over that of independent increments
-HELD_SLIP = 3e-3             # sqrt(m), of wheels under a camera that shakes
-MAX_STILL_CONTRADICTING = 0.5    # of these, by the slip that is believed
-MAX_CONTRADICTING = 0.005    # share of the measurements, by which a small slip may contradict more
+LARGE_SLIP = 0.01            # sqrt(m), from which on slow errors of sensors may be the cause
+AS_STATED = 1.25             # ratio of sigmas, within which errors are as large as stated
+PLAUSIBLE_FACTOR = 3.0       # on standard deviations, beyond which a sensor is not believed slow
+MAX_CONTRADICTING = 0.02     # share of the measurements that may contradict them
 
 VISIT_GAP = 30               # typical intervals between sightings of a marker, that end a visit
 MIN_VISIT = 3                # number of accepted sightings of a visit that is compared
@@ -90,76 +92,48 @@ MIN_SIGMA = 0.02             # m or rad, of the path between two visits
 def memory_or_slip(problem: Problem, state: State) -> Fit:
     """The Fit of a Problem, near its solution, that explains slow errors by memory, or by slip.
 
-    Slow errors of sensors bend the path as a large slip does. A small slip is more probable, so
-    memory is sought first, unless measurements then contradict the path even if their standard
-    deviations were PLAUSIBLE_FACTOR times those in the files, where with a larger slip they do not.
-    A camera that shakes bends it, too, but not for long: then the slip is HELD_SLIP.
+    Slow errors of sensors bend the path as slip does. If errors are independent and as large as
+    stated once the slip is learned, it is slip, or what is found to be wrong on wheels. Else memory
+    is sought first, unless measurements then contradict the path.
     """
-    fit = _by_memory_or_slip(problem, state)
-    if not is_shaken(fit):
+    fit = refine_without_memory(problem, state)
+    factors = np.log([fit.problem.noise.sightings, fit.problem.noise.ranges])
+    if np.abs(factors).max() < np.log(AS_STATED) and not has_memory(fit):
         return fit
-    log.info("slip %.3g mm after 1 m does not accumulate: the camera shakes",
-             1e3 * fit.problem.noise.slip)
-    return refine(with_held_slip(problem), state)
+    by_memory = refine(replace(problem, memory_first=True), state)
+    return by_memory if _is_plausible(by_memory) else refine(problem, state)
 
 
-def _by_memory_or_slip(problem, state):
-    """The Fit by memory first, or by slip first."""
-    fit = refine(problem, state)
-    if not (fit.problem.accepted.share < 1).any():
-        return fit
-    by_memory = _contradicting_share(fit)
-    if by_memory <= MAX_CONTRADICTING:
-        return fit
-    other = refine(replace(problem, memory_first=False), state)
-    by_slip = _contradicting_share(other)
-    is_slip = by_slip < MAX_STILL_CONTRADICTING * (by_memory - MAX_CONTRADICTING)
-    log.info("memory first: slip %.3g mm after 1 m, %.1f %% contradict; slip first: %.3g mm, %.1f "
-             "%%: %s", 1e3 * fit.problem.noise.slip, 100 * by_memory,
-             1e3 * other.problem.noise.slip, 100 * by_slip, "slip" if is_slip else "memory")
-    return other if is_slip else fit
-
-
-def is_shaken(fit: Fit) -> bool:
-    """Whether the learned slip is large, and errors of odometry do not accumulate as slips do.
-
-    An error that all markers of an image share, as where the camera tilts, moves the path there and
-    back again. The variance of the sum of independent slips grows with the number of steps, that
-    of such errors does not (variance ratio: Lo and MacKinlay, Rev. Financial Studies 1(1), 1988).
-    Rounding of coarse counts does not accumulate, either, but is odometry's. Turns are summed, too,
-    since those of a wrong wheelbase do accumulate.
-    """
+def _is_plausible(fit):
+    """Whether hardly any measurement contradicts a Fit with PLAUSIBLE_FACTOR as its noise."""
     problem = fit.problem
-    slip = problem.noise.slip
-    if not problem.measurements.learned[0] or slip < MIN_SHAKEN_SLIP:
-        return False
-    error = odometry_error(problem.odometry, fit.state.poses, fit.state.c[WHEELS])[0]
-    sigma = np.sqrt(np.diagonal(problem.odometry.covariance(slip), axis1=1, axis2=2))
-    if np.median(sigma[:, 0]) < problem.measurements.dataset.vehicle.metres_per_count.max():
-        return False
-    ahead_and_turned = (error / sigma)[:, [0, 2]]
-    total = cumulative(ahead_and_turned)
-    sums = total[SHAKEN_SPAN:] - total[:-SHAKEN_SPAN]
-    if len(sums) < MIN_SHAKEN_SPANS * SHAKEN_SPAN:
-        return False
-    ratio = np.mean(sums**2) / (SHAKEN_SPAN * np.mean(ahead_and_turned**2))
-    return bool(ratio < MAX_VARIANCE_RATIO)
+    noise = problem.noise._replace(sightings=PLAUSIBLE_FACTOR, ranges=PLAUSIBLE_FACTOR)
+    accepted = accepted_measurements(replace(problem, noise=noise), fit.state)
+    share = np.mean(np.concatenate([kind.weight for kind in accepted]) == 0)
+    log.info("memory first: slip %.3g mm after 1 m, %.1f %% contradict",
+             1e3 * problem.noise.slip, 100 * share)
+    return share <= MAX_CONTRADICTING
 
 
-def with_held_slip(problem: Problem) -> Problem:
-    """The Problem of a drive with a camera that shakes, whose slip is known to be HELD_SLIP."""
-    m = problem.measurements
-    vehicle = replace(m.dataset.vehicle, slip=HELD_SLIP)
-    held = replace(m, dataset=replace(m.dataset, vehicle=vehicle))
-    return replace(problem, measurements=held, noise=with_known(problem.noise, vehicle),
-                   is_shaken=True)
+def without_large_slip(
+        dataset: Dataset, start: Callable[..., Fit],
+        decide: Callable[[Fit], Fit]) -> tuple[Fit, np.ndarray | None]:
+    """What `most_consistent` finds, decided anew with memory first if the slip is large.
 
-
-def _contradicting_share(fit):
-    """Share of all measurements that a Fit rejects at PLAUSIBLE_FACTOR."""
-    noise = fit.problem.noise._replace(sightings=PLAUSIBLE_FACTOR, ranges=PLAUSIBLE_FACTOR)
-    accepted = accepted_measurements(replace(fit.problem, noise=noise), fit.state)
-    return np.mean(np.concatenate([kind.weight for kind in accepted]) == 0)
+    An error that all markers of an image share, as where the camera tilts, bends the path as slip
+    does, and so does a wrong statement on wheels, until it is found. Where wheels do slip, memory
+    first finds it, too.
+    """
+    found = most_consistent(dataset, start, decide)
+    problem = found[0].problem
+    is_large = problem.measurements.learned[0] and problem.noise.slip >= LARGE_SLIP
+    if problem.memory_first or not is_large:
+        return found
+    try:
+        other = most_consistent(dataset, partial(start, memory_first=True), decide)
+    except (DatasetError, np.linalg.LinAlgError):
+        return found
+    return other if _is_plausible(other[0]) else found
 
 
 def better_model(fit: Fit) -> Fit:
@@ -198,6 +172,8 @@ def calibrated(fit: Fit) -> Fit:
         tried.append(proposal.prior.groups)
         proposed = _released(fit, proposal)
         if proposed is None:
+            if proposal.prior.groups < fit.problem.prior.groups:
+                fit = replace(fit, explanations=proposal.explanations)
             break
         fit = proposed
     return replace(fit, explanations=_confirmed(fit))
@@ -440,7 +416,7 @@ def _likelihood(fit):
     B = sums.border[:-p, :-1]
     selected = np.zeros((len(B), 2))
     selected[position] = np.eye(2)
-    covariance = solution.solve(selected)
+    covariance = solution.lu.solve(selected)
     return _Likelihood(L, np.where(known, L @ u - gradient, 0.0),
                        variance=np.trace(covariance[position]), lever=-covariance.T @ B)
 
@@ -624,7 +600,7 @@ def spares_sightings(fit: Fit | None, other: Fit, explanation: str, least: float
     wrong_without = contradicted(other, factor)
     spared = np.count_nonzero(wrong_without & ~wrong)
     lost = np.count_nonzero(wrong & ~wrong_without)
-    slips = fit.problem.noise.slip > max(MIN_SHAKEN_SLIP, MAX_SLIP_RATIO * other.problem.noise.slip)
+    slips = fit.problem.noise.slip > max(LARGE_SLIP, MAX_SLIP_RATIO * other.problem.noise.slip)
     is_believed = spared - lost >= least and lost <= max(1, MAX_LOST * spared) and not slips
     log.info("%s: spare %d sightings, lose %d, slip %.3g mm after 1 m, %.3g without: %s",
              explanation, spared, lost, 1e3 * fit.problem.noise.slip,

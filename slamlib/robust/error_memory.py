@@ -6,18 +6,21 @@ as one. With the correlation rho of the errors of two measurements of a landmark
 share 1 / (1 + sum of rho with all others) of its information (the design effect: Kish, Survey
 Sampling, 1965, section 5.4).
 
-A marker takes over what all its errors have in common, and this mean has the variance that the
-residuals lack. So it is added: at each lag, for residuals u in the standard deviations of the
-errors,
+The solution takes over a part of the errors: a marker the mean of its own, the path what is slow.
+So products of errors are not those of residuals. They are expected by the posterior, as in the EM
+algorithm (Dempster, Laird and Rubin, J. Royal Statistical Society B 39(1), 1977): with what an
+error changes by in draws from it,
+
+    mean of u u' = products of the residuals + mean of products of their changes.
+
+A posterior that follows from the shares makes the mean of u^2 near 1, u in standard deviations. Its
+lack, where the model takes over more than it knows, is added to the products at each lag:
 
     rho = mean of u u' + 1 - mean of u^2.
 
-Nothing is added for an antenna: what its ranges have in common is an entry of the calibration.
-What is not used for this, such as an echo, keeps as much as the others do on average: it must not
-outweigh them.
-
-The residuals of n independent errors of a landmark correlate by -1/n without their mean, so (1 -
-correlation) / n is added to the correlation of neighbours, by which memory is recognised.
+Not so for ranges: what those of an antenna have in common is an entry of the calibration. What is
+not used for this, such as an echo, keeps as much as the others do on average: it must not outweigh
+them.
 
 After a break the sensor sees the landmark from elsewhere, with another error.
 """
@@ -50,7 +53,8 @@ class _Pairs(NamedTuple):
 
     first: np.ndarray            # (p,) rows of the earlier ones
     second: np.ndarray           # (p,) rows of the later ones
-    lag: np.ndarray              # (p,) int, typical intervals between them
+    lag: np.ndarray              # (p,) typical intervals between them
+    product: np.ndarray          # (p,) expected, of their errors
 
 
 def runs(landmark: np.ndarray, pose: np.ndarray, max_pause: float) -> tuple[float, np.ndarray]:
@@ -66,31 +70,33 @@ def runs(landmark: np.ndarray, pose: np.ndarray, max_pause: float) -> tuple[floa
     return typical, np.cumulative_sum(begins, include_initial=True)
 
 
-def error_memory(landmark: np.ndarray, pose: np.ndarray, u: np.ndarray,
-                 used: np.ndarray, hides_mean: bool = True) -> Memory:
+def error_memory(landmark: np.ndarray, pose: np.ndarray, u: np.ndarray, changes: np.ndarray,
+                 used: np.ndarray, adds_lack: bool = True) -> Memory:
     """The Memory of measurements of `landmark` (m,), rows or ids, at encoder poses (m,).
 
-    u (m, d) are residuals in standard deviations of the errors; those not `used` (m,) do not count.
-    `hides_mean` is whether the landmark takes over the mean of its errors.
+    u (m, d) are residuals in standard deviations of the errors, `changes` (m, d, k) theirs in draws
+    from the posterior; those not `used` (m,) do not count. `adds_lack` is whether what the mean of
+    u^2 lacks of 1 is added.
     """
     rows = np.flatnonzero(used)
     rows = rows[np.lexsort((pose[rows], landmark[rows]))]
-    u = u[rows]
     share = np.ones(len(used))
-    landmark_count = len(np.unique(landmark[rows]))
-    variance = np.mean(u**2) if landmark_count < len(rows) else 0.0
+    none = Memory(correlation=0.0, sigma=1.0, share=share)
+    if len(np.unique(landmark[rows])) == len(rows):      # none is measured twice
+        return none
+    errors = np.concatenate([u[..., None], changes / np.sqrt(changes.shape[2])], axis=2)[rows]
+    errors = errors.reshape(len(rows), -1) / np.sqrt(u.shape[1])
+    variance = np.mean(_products(errors, errors))
     if variance < MIN_VARIANCE:
-        return Memory(correlation=0.0, sigma=1.0, share=share)
-    pairs = _pairs(landmark[rows], pose[rows])
-    product = np.mean(u[pairs.first] * u[pairs.second], axis=1)
+        return none
+    pairs = _pairs(landmark[rows], pose[rows], errors)
     count = np.bincount(pairs.lag, minlength=MAX_LAG + 1)
-    covariance = np.bincount(pairs.lag, product, MAX_LAG + 1) / np.maximum(count, 1)
+    covariance = np.bincount(pairs.lag, pairs.product, MAX_LAG + 1) / np.maximum(count, 1)
     correlation = covariance[1] / variance
-    correlation += (1 - correlation) * landmark_count / len(rows)
     neighbours = count[1] * u.shape[1]
     sigma = 1 / np.sqrt(max(neighbours, 1))
     if correlation >= max(MIN_CORRELATION, MIN_SIGNIFICANCE * sigma):
-        rho = covariance + hides_mean * max(0.0, 1 - variance)
+        rho = covariance + adds_lack * max(0.0, 1 - variance)
         remembered = (rho >= MIN_RHO) & (count >= MIN_PAIRS)
         remembered[0] = True                         # pairs of less than half an interval
         rho[~np.logical_and.accumulate(remembered)] = 0.0
@@ -102,18 +108,21 @@ def error_memory(landmark: np.ndarray, pose: np.ndarray, u: np.ndarray,
     return Memory(correlation, sigma, share)
 
 
-def _pairs(landmark, pose):
-    """The _Pairs of measurements sorted by `landmark` (m,), then by `pose` (m,)."""
+def _products(first, second):
+    """Scalar products (m,) of rows (m, w)."""
+    return np.einsum("ij,ij->i", first, second)
+
+
+def _pairs(landmark, pose, errors):
+    """The _Pairs of `errors` (m, w) sorted by `landmark` (m,), then by `pose` (m,)."""
     interval, run = runs(landmark, pose, MAX_PAUSE)
     found = []
     for step in range(1, min(MAX_LAG, len(run) - 1) + 1):
-        first = np.flatnonzero(run[step:] == run[:-step])
-        second = first + step
-        distance = pose[second] - pose[first]
-        lag = np.rint(distance / interval).astype(int)
-        pairs = np.stack([first, second, lag])
-        close = lag <= MAX_LAG
+        lag = np.rint((pose[step:] - pose[:-step]) / interval)
+        close = (run[step:] == run[:-step]) & (lag <= MAX_LAG)
         if not close.any():
             break
-        found.append(pairs[:, close])
-    return _Pairs(*np.concatenate(found, axis=1))
+        first = np.flatnonzero(close)
+        product = _products(errors[:-step], errors[step:])[close]
+        found.append((first, first + step, lag[close].astype(int), product))
+    return _Pairs(*map(np.concatenate, zip(*found)))

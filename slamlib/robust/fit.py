@@ -19,7 +19,14 @@ from slamlib.core.sightings import GATE, MEDIAN_CHI2, POINT_GATE
 from slamlib.robust.calibration import RANGE_LAG, SIGHTING_LAG, WHEELS
 from slamlib.robust.error_memory import Memory, error_memory
 from slamlib.robust.factors import linearize_measurements, preintegrate_odometry
-from slamlib.robust.linear import Problem, State, laplace_approximation
+from slamlib.robust.linear import (
+    NormalEquations,
+    Problem,
+    State,
+    errors_after,
+    laplace_approximation,
+    posterior_draws,
+)
 from slamlib.robust.measurements import (
     Accepted,
     AcceptedMeasurements,
@@ -39,12 +46,13 @@ CAUCHY_SCALES = (10.0, 3.0)   # sigmas, scale of the kernel in each round
 ROUGH = 1e-4                 # relative decrease of the error at which a round ends
 MIN_RESIDUALS = 20           # number of measurements from which their scatter gives a factor
 
-MAX_ROUNDS = 6               # number of rounds of wheels, noise and accepted measurements
+DRAWS = 8                    # number of draws from the posterior, for products of errors
+MAX_ROUNDS = 20              # number of rounds of wheels, noise and accepted measurements
 NEGLIGIBLE_MOVE = 3e-3       # relative, of a wheel parameter since odometry was linearised
 SETTLED_MOVE = 1e-6          # the same, at the solution that is handed in
 MAX_SINCE = 0.5              # encoder steps, of a delay since then
 NEGLIGIBLE_CHANGE = 1e-3     # share of the measurements whose weight may change at the same noise
-SIMILAR_SHARE = 0.1          # relative change of a share of memory that is none
+SIMILAR_SHARE = 0.03         # relative change of a share of memory that is none
 
 
 def accepted_measurements(
@@ -92,17 +100,24 @@ def residuals(problem: Problem, state: State) -> tuple[np.ndarray, np.ndarray]:
     return -sightings.e, -ranges.e[:, 0]
 
 
-def error_memories(problem: Problem, state: State) -> tuple[Memory, Memory]:
-    """The Memory of the errors of sightings, and that of ranges but echoes, at a solution."""
+def error_memories(problem: Problem, state: State,
+                   accepted: AcceptedMeasurements) -> tuple[Memory, Memory]:
+    """The Memory of the errors of sightings, and that of ranges but echoes, of those `accepted`.
+
+    By the posterior of a Problem at its solution. Raises DatasetError as `posterior_draws`.
+    """
     m = problem.measurements
-    sightings, ranges = problem.accepted
-    residual, late = residuals(problem, state)
-    is_direct = np.abs(late) < MAX_DIRECT
+    steps = posterior_draws(NormalEquations(problem, state), DRAWS)
+    factors = linearize_measurements(replace(problem, accepted=accept_all(m)), state)
+    changes = [errors_after(each, m.structure, steps) for each in factors]
+    sightings, ranges = factors
+    is_direct = np.abs(ranges.e[:, 0]) < MAX_DIRECT
     of_sightings = error_memory(
-        m.marker_row, m.frame[m.sightings.row], residual, sightings.weight > 0)
+        m.marker_row, m.frame[m.sightings.row], sightings.e, changes[0],
+        accepted.sightings.weight > 0)
     of_ranges = error_memory(
-        m.ranges.antenna, m.frame[m.ranges.row], late[:, None], is_direct & (ranges.weight > 0),
-        hides_mean=False)
+        m.ranges.antenna, m.frame[m.ranges.row], ranges.e, changes[1],
+        is_direct & (accepted.ranges.weight > 0), adds_lack=False)
     return of_sightings, of_ranges
 
 
@@ -175,26 +190,39 @@ def refine(problem: Problem, state: State,
     Problem and State; None keeps those of the problem, with their shares. Raises DatasetError as
     `optimize`, and numpy.linalg.LinAlgError if odometry's covariance is singular.
 
-    Slow errors of sensors and slip explain the same residuals. If `problem.memory_first`, the share
-    that memory leaves of a measurement's information is found together with the noise, from its
-    start values on; else at the end, for the noise as it was learned without.
+    Slow errors of sensors and slip explain the same residuals. So the shares that memory leaves of
+    the measurements' information are found in turn with the noise: from its start values on if
+    `problem.memory_first`, else from the noise as it is learned without them.
     """
     if accept is None:
         given = problem.accepted
         return _settled_fit(problem, state, lambda *_: given)
-    problem = replace(problem, noise=noise_of_scatter(problem, state))
 
     def with_memory(problem, state):
-        return _accepted_with_memory(problem, state, accept)
+        accepted = accept(problem, state)
+        memories = error_memories(problem, state, accepted)
+        return accepted.with_shares(memory.share for memory in memories)
 
-    if problem.memory_first:
-        return _settled_fit(problem, state, with_memory)
-    fit = _settled_fit(problem, state, accept)
-    accepted = with_memory(fit.problem, fit.state)
-    if not (accepted.share < 1).any():
-        return fit
-    problem = _with_least_slip(replace(fit.problem, accepted=accepted))
-    return _fit(problem, optimize(problem, fit.state), fit.posterior)
+    problem = replace(problem, noise=noise_of_scatter(problem, state))
+    if not problem.memory_first:
+        fit = _settled_fit(problem, state, accept)
+        if not has_memory(fit):
+            return fit
+        problem = fit.problem
+        state = fit.state
+    return _settled_fit(problem, state, with_memory)
+
+
+def refine_without_memory(problem: Problem, state: State) -> Fit:
+    """The Fit as of `refine` in which all errors are independent."""
+    problem = replace(problem, noise=noise_of_scatter(problem, state))
+    return _settled_fit(problem, state, accepted_measurements)
+
+
+def has_memory(fit: Fit) -> bool:
+    """Whether the errors of measurements that a Fit accepts have memory."""
+    memories = error_memories(fit.problem, fit.state, fit.problem.accepted)
+    return any((memory.share < 1).any() for memory in memories)
 
 
 def _settled_fit(problem, state, accept):
@@ -285,13 +313,6 @@ def settled(fit: Fit) -> Fit:
             break
         problem = _relinearized(problem, state)
     return replace(fit, problem=problem, state=state, converged=optimum.converged and is_linear)
-
-
-def _accepted_with_memory(problem, state, accept):
-    """The AcceptedMeasurements with the shares that memory leaves of their information."""
-    accepted = accept(problem, state)
-    memories = error_memories(replace(problem, accepted=accepted), state)
-    return accepted.with_shares(memory.share for memory in memories)
 
 
 def _with_least_slip(problem):

@@ -11,7 +11,6 @@ and ranges. The group of odometry depends on the slip, those of sightings and ra
 noise factors. Each value of the noise then costs one decomposition, which gives its evidence.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from operator import attrgetter
@@ -19,10 +18,11 @@ from operator import attrgetter
 import numpy as np
 from gtsam.noiseModel import mEstimator
 from scipy.sparse import csc_array
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import SuperLU, splu, spsolve_triangular
 
 from slamlib.core import odometry, se2
 from slamlib.core.graph import GUESS_PRIOR_SIGMA
+from slamlib.core.graph_solution import undetermined
 from slamlib.core.increments import OdometryIncrements
 from slamlib.robust.calibration import Prior
 from slamlib.robust.factors import (
@@ -79,8 +79,7 @@ class Problem:
     noise: Noise
     prior: Prior             # of the calibration
     reference: np.ndarray    # (p,) a calibration, by whose delays rows are chosen
-    memory_first: bool = True    # whether slow errors are sought before the noise is learned
-    is_shaken: bool = False      # whether the camera shakes, so that the slip is not learned
+    memory_first: bool = False   # whether memory is sought before a slip is learned
 
     @property
     def active(self) -> np.ndarray:
@@ -139,7 +138,8 @@ class LinearSolution:
     gradient: np.ndarray     # (q,) by the calibration, the other unknowns eliminated
     log_determinant: float   # of the information matrix
     decrease: float          # of half the squared error, by the step
-    solve: Callable[[np.ndarray], np.ndarray]    # H^-1 times (n, k)
+    by_c: np.ndarray         # (n, q) H^-1 B
+    lu: SuperLU              # of H
 
 
 @dataclass(frozen=True)
@@ -260,6 +260,14 @@ class NormalEquations:
         return Sums(H.ravel(), border, np.sum(factors.e**2), factors.log_determinant)
 
 
+def errors_after(factors: LinearizedFactors, structure: Structure,
+                 steps: np.ndarray) -> np.ndarray:
+    """Changes (m, d, k) of the whitened errors of LinearizedFactors by steps (n + q, k)."""
+    rows = structure.rows[structure.variables[factors.index]].reshape(-1, 6)
+    of_c = steps[len(structure.diagonal) + factors.columns]
+    return factors.J @ steps[rows] + factors.J_c @ of_c
+
+
 def _summed_by(number, values, count):
     """(count, w) sums of those rows of values (m, w) that have the same number (m,), of any shape.
 
@@ -295,7 +303,27 @@ def linear_solution(structure: Structure, sums: Sums) -> LinearSolution | None:
         delta=delta, S=S, gradient=gradient,
         log_determinant=determinant.logabsdet + np.sum(np.log(pivots)),
         decrease=-(sums.border[:, -1] @ delta) / 2,
-        solve=lu.solve)
+        by_c=solved[:, :-1], lu=lu)
+
+
+def posterior_draws(equations: NormalEquations, count: int) -> np.ndarray:
+    """Steps (n + q, count) from the solution to draws from its posterior, the same at each call.
+
+    H = U^T D^-1 U with the pivots D, so that U^-1 D^1/2 z has the covariance H^-1 if z is white.
+    Raises DatasetError where the equations are singular to rounding.
+    """
+    sums = equations.sums(equations.problem.noise, consistent=True)
+    solution = linear_solution(equations.structure, sums)
+    if solution is None:
+        raise undetermined()
+    lu = solution.lu
+    rng = np.random.default_rng(0)
+    white = rng.standard_normal((len(lu.perm_c), count))
+    scaled = np.sqrt(lu.U.diagonal())[:, None] * white
+    for_known_c = spsolve_triangular(lu.U, scaled, lower=False)[lu.perm_c]
+    white_c = rng.standard_normal((len(solution.S), count))
+    of_c = np.linalg.solve(np.linalg.cholesky(solution.S).T, white_c)
+    return np.concatenate([for_known_c - solution.by_c @ of_c, of_c])
 
 
 def laplace_approximation(equations: NormalEquations, noise: Noise) -> tuple[np.ndarray, float]:

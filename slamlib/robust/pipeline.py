@@ -15,18 +15,17 @@ from slamlib.core.errors import require
 from slamlib.core.graph import require_rows
 from slamlib.core.odometry import MODELS
 from slamlib.core.records import Dataset
-from slamlib.robust.calibration import Prior
 from slamlib.robust.choices import (
     better_model,
     calibrated,
     memory_or_slip,
     most_consistent,
-    with_held_slip,
+    without_large_slip,
 )
 from slamlib.robust.fit import CAUCHY_SCALES, Fit, narrow_kernels, refine, settled
 from slamlib.robust.initialization import initial_state, state_from_poses
 from slamlib.robust.jumps import NO_JUMPS
-from slamlib.robust.linear import Problem, build_problem
+from slamlib.robust.linear import build_problem
 from slamlib.robust.measurements import Measurements, Noise, measure
 from slamlib.robust.part_faults import with_wheels_mended
 from slamlib.robust.result import SlamResult, slam_result
@@ -85,14 +84,14 @@ def estimate(dataset: Dataset, slip: float | None = None, model: str | None = No
     dataset = dataset.stating(options, "estimate")
     log.info("estimate of %s: %d poses", dataset.name, len(dataset.ticks))
 
-    def start(jumps=NO_JUMPS, places=None, like=None):
+    def start(jumps=NO_JUMPS, places=None, like=None, memory_first=False):
         aruco = dataset.aruco
         if places is not None:
             aruco = replace(aruco, marker=places[:, 1])
         measurements = measure(replace(dataset, aruco=aruco), poses, jumps)           # 1
         if previous is not None and like is None:
             return fit_from_previous(measurements, previous, model)
-        return fit_from_odometry(measurements, model or "arc", like)                  # 2 to 6
+        return fit_from_odometry(measurements, model or "arc", like, memory_first)    # 2 to 6
 
     def decide(fit):                                                                  # 6
         if previous is not None or model is not None:
@@ -102,7 +101,9 @@ def estimate(dataset: Dataset, slip: float | None = None, model: str | None = No
         other = better_model(fit) if fit.problem.prior.groups else fit
         return fit if other is fit else calibrated(other)
 
-    if previous is not None and len(previous.rejected):
+    if previous is None:
+        fit, places = without_large_slip(dataset, start, decide)
+    elif len(previous.rejected):
         fit = decide(start(previous.jumps, previous.places))
         places = previous.places
     else:
@@ -129,29 +130,25 @@ def require_same_drive(dataset: Dataset, previous: SlamResult | None):
 
 
 def fit_from_odometry(measurements: Measurements, model: str = "arc",
-                      like: Fit | None = None) -> Fit:
+                      like: Fit | None = None, memory_first: bool = False) -> Fit:
     """The Fit of Measurements with start values by odometry; raises DatasetError as `estimate`.
 
     `like` is a Fit whose decisions it takes over: the model of the steps, groups of the calibration
-    with their explanations, and the order of memory.
+    with their explanations, and the order of memory. Without it, memory may be sought first.
     """
     if like is not None:
         model = like.problem.odometry.model
     problem = build_problem(measurements, model)                                      # 2
     state = narrow_kernels(problem, initial_state(measurements, model))               # 4, 5
+    if like is None and memory_first:                                                 # 6
+        return refine(replace(problem, memory_first=True), state)
     if like is None:
-        return memory_or_slip(problem, state)                                         # 6
-    problem = decided_like(problem, like.problem, like.problem.prior)
+        return memory_or_slip(problem, state)
+    decided = like.problem
+    problem = replace(problem, prior=decided.prior, memory_first=decided.memory_first)
     state = narrow_kernels(problem, replace(state, c=like.state.c), CAUCHY_SCALES[-1:])
     fit = refine(problem, state)
     return replace(fit, explanations=like.explanations, lead=like.lead)
-
-
-def decided_like(problem: Problem, decided: Problem, prior: Prior) -> Problem:
-    """The Problem with a prior of the calibration, and what else another one has decided."""
-    if decided.is_shaken:
-        problem = with_held_slip(problem)
-    return replace(problem, prior=prior, memory_first=decided.memory_first)
 
 
 def fit_from_previous(measurements: Measurements, previous: SlamResult,
@@ -161,7 +158,7 @@ def fit_from_previous(measurements: Measurements, previous: SlamResult,
     problem = build_problem(m, model or previous.model, Noise(previous.slip), previous.wheel)
     decided = previous.fit.problem
     prior = m.calibration.prior(decided.prior.groups, decided.prior.width)
-    problem = decided_like(problem, decided, prior)
+    problem = replace(problem, prior=prior, memory_first=decided.memory_first)
     c = m.calibration.taken_from(previous.calibration, previous.c)
     state = state_from_poses(m, previous.poses[m.frame], previous.covariances[m.frame], c)
     state = narrow_kernels(problem, state, CAUCHY_SCALES[-1:])

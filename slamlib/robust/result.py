@@ -148,7 +148,7 @@ def slam_result(fit: Fit) -> SlamResult:
     noise_sigma = np.zeros(3)
     if fit.posterior is not None:
         noise_sigma = np.sqrt(np.diag(fit.posterior.covariance))
-    memories = error_memories(problem, state)
+    memories = error_memories(problem, state, problem.accepted)
     return SlamResult(
         poses=poses, covariances=covariances,
         marker=m.marker[mapped], marker_in_world=markers,

@@ -8,6 +8,7 @@ import numpy as np
 from slamlib.core import se2
 from slamlib.core.sightings import GATE
 from slamlib.core.vehicle import Vehicle
+from slamlib.robust.choices import LARGE_SLIP
 from slamlib.robust.file_doubts import Doubt
 from slamlib.robust.fused import LearnedFusion
 from slamlib.robust.jumps import UNKNOWN_SIGMA
@@ -304,13 +305,15 @@ def _slip_doubt(slip):
 
 def _path_doubts(result):
     """Doubts on slip, and a solution that still changed."""
-    if result.fit.problem.is_shaken:
+    if result.fit.problem.memory_first and result.slip < LARGE_SLIP:
         yield Doubt("camera-shakes", (
-            "Errors of all markers of an image are alike. They move the path to and fro as a large "
-            f"slip would, but do not accumulate as slip does: {_problem(result)} takes the slip to "
-            f"be {1e3 * result.slip:.0f} mm (one standard deviation) after one metre."), (
-            "Look whether the camera tilts or shakes while the vehicle moves, and state the slip "
-            "in vehicle.toml."))
+            "Errors of the sensors that change slowly, or alike for all markers of an image, bend "
+            f"the path as a large slip would: {_problem(result)} takes them for errors of the "
+            f"sensors, and finds a slip of {1e3 * result.slip:.0f} mm (one standard deviation) "
+            "after one metre."), (
+            "Look whether the camera tilts or shakes while the vehicle moves. If it is the wheels "
+            "that slip, state their slip in vehicle.toml. The rounding of counts that are "
+            "centimetres apart looks the same."))
     if result.noise_sigma[0]:
         yield from _slip_doubt(result.slip)
     if not result.converged:
