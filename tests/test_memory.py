@@ -133,7 +133,7 @@ def test_a_camera_that_shakes_is_no_slip():
     found = estimate(without)
     assert aligned_ate(found, truth) < 0.012     # 0.028 by slip
     assert mean_nees(found, truth) < 6           # 12 by slip
-    assert "camera-shakes" in [doubt.what for doubt in solution_doubts(found)]
+    assert "marker-memory" in [doubt.what for doubt in solution_doubts(found)]
     both = estimate(dataset, previous=found)
     assert both.fit.problem.memory_first and both.slip < 2e-3
 

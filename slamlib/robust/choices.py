@@ -31,6 +31,7 @@ import numpy as np
 
 from slamlib.core import se2
 from slamlib.core.errors import DatasetError
+from slamlib.core.increments import TYPICAL_SLIP
 from slamlib.core.records import ArucoReadings, Dataset
 from slamlib.core.sightings import GATE
 from slamlib.robust.calibration import RADII, SCALE, SIZE, WHEEL_SCALE, WHEELS, Prior
@@ -72,12 +73,14 @@ MAX_RATIO = 2.5              # of these over what is stated, or the reverse
 MIN_INFORMATION = 1e-3       # about an entry, in wide sigmas, below which it is not considered
 MAX_PROPOSALS = 5            # number of sets that are solved
 MAX_COST = 1.5               # ratio of sigmas of the last position, by what is released untold
+MIN_SPARED_SLIP = 4.0        # ratio of the slips without and with jumps that are believed
 MIN_JUMP_LEAD = 10.0         # log evidence by which a jump found at the solution is believed
 
 LARGE_SLIP = 0.01            # sqrt(m), from which on slow errors of sensors may be the cause
 AS_STATED = 1.25             # ratio of sigmas, within which errors are as large as stated
 PLAUSIBLE_FACTOR = 3.0       # on standard deviations, beyond which a sensor is not believed slow
-MAX_CONTRADICTING = 0.02     # share of the measurements that may contradict them
+MAX_CONTRADICTING = 0.02     # share of the measurements that may contradict slow errors
+MAX_RATIO_CONTRADICTING = 2.0    # of this share over that by slip, above which it is slip
 
 VISIT_GAP = 30               # typical intervals between sightings of a marker, that end a visit
 MIN_VISIT = 3                # number of accepted sightings of a visit that is compared
@@ -85,6 +88,7 @@ MAX_REJECTED_SHARE = 0.5     # of the sightings of a visit
 MAX_SLIP_RATIO = 2.0         # of the slips with and without an explanation that is believed
 MIN_SPARED = 2               # number of sightings, by each place of an id that is believed
 MAX_LOST = 0.1               # of these, number that may be rejected instead
+LOST_WEIGHT = 2              # number of these that outweigh one that is rejected instead
 PLACE_GATE = 60.0            # squared distance of x, y, heading in sigmas, beyond it another place
 MIN_SIGMA = 0.02             # m or rad, of the path between two visits
 
@@ -92,27 +96,42 @@ MIN_SIGMA = 0.02             # m or rad, of the path between two visits
 def memory_or_slip(problem: Problem, state: State) -> Fit:
     """The Fit of a Problem, near its solution, that explains slow errors by memory, or by slip.
 
-    Slow errors of sensors bend the path as slip does. If errors are independent and as large as
-    stated once the slip is learned, it is slip, or what is found to be wrong on wheels. Else memory
-    is sought first, unless measurements then contradict the path.
+    Slow errors of sensors bend the path as slip does. If errors are independent once the slip is
+    learned, and as large as stated or the slip small, it is slip, or what is found to be wrong on
+    wheels. Else memory is sought first, unless measurements then contradict the path more than with
+    slip. Where it was sought first already, a large slip is not believed.
     """
-    fit = refine_without_memory(problem, state)
-    factors = np.log([fit.problem.noise.sightings, fit.problem.noise.ranges])
-    if np.abs(factors).max() < np.log(AS_STATED) and not has_memory(fit):
+    slip_first = replace(problem, memory_first=False)
+    fit = refine_without_memory(slip_first, state)
+    slip, *factors = fit.problem.noise
+    is_as_stated = np.abs(np.log(factors)).max() < np.log(AS_STATED)
+    is_believed = slip < AS_STATED * TYPICAL_SLIP or is_as_stated
+    if problem.memory_first:
+        is_believed &= slip < LARGE_SLIP
+    if is_believed and not has_memory(fit):
         return fit
     by_memory = refine(replace(problem, memory_first=True), state)
-    return by_memory if _is_plausible(by_memory) else refine(problem, state)
+    if _contradicting_share(by_memory) <= MAX_CONTRADICTING:
+        return by_memory
+    by_slip = refine(slip_first, state)
+    return by_memory if _is_as_good(by_memory, by_slip) else by_slip
 
 
-def _is_plausible(fit):
-    """Whether hardly any measurement contradicts a Fit with PLAUSIBLE_FACTOR as its noise."""
-    problem = fit.problem
-    noise = problem.noise._replace(sightings=PLAUSIBLE_FACTOR, ranges=PLAUSIBLE_FACTOR)
-    accepted = accepted_measurements(replace(problem, noise=noise), fit.state)
-    share = np.mean(np.concatenate([kind.weight for kind in accepted]) == 0)
-    log.info("memory first: slip %.3g mm after 1 m, %.1f %% contradict",
-             1e3 * problem.noise.slip, 100 * share)
-    return share <= MAX_CONTRADICTING
+def _is_as_good(by_memory, by_slip):
+    """Whether hardly more measurements contradict one Fit than the other."""
+    share = _contradicting_share(by_memory)
+    share_by_slip = _contradicting_share(by_slip)
+    log.info("memory first: slip %.3g mm after 1 m, %.1f %% contradict; slip first: %.3g mm, "
+             "%.1f %%", 1e3 * by_memory.problem.noise.slip, 100 * share,
+             1e3 * by_slip.problem.noise.slip, 100 * share_by_slip)
+    return share <= max(MAX_CONTRADICTING, MAX_RATIO_CONTRADICTING * share_by_slip)
+
+
+def _contradicting_share(fit):
+    """Share of all measurements that a Fit rejects with PLAUSIBLE_FACTOR as its noise."""
+    noise = fit.problem.noise._replace(sightings=PLAUSIBLE_FACTOR, ranges=PLAUSIBLE_FACTOR)
+    accepted = accepted_measurements(replace(fit.problem, noise=noise), fit.state)
+    return np.mean(np.concatenate([kind.weight for kind in accepted]) == 0)
 
 
 def without_large_slip(
@@ -133,7 +152,7 @@ def without_large_slip(
         other = most_consistent(dataset, partial(start, memory_first=True), decide)
     except (DatasetError, np.linalg.LinAlgError):
         return found
-    return other if _is_plausible(other[0]) else found
+    return other if _is_as_good(other[0], found[0]) else found
 
 
 def better_model(fit: Fit) -> Fit:
@@ -208,7 +227,8 @@ def _released(fit, proposal):
     problem = replace(fit.problem, prior=proposal.prior)
     names = ", ".join(sorted(proposal.prior.groups)) or "nothing"
     try:
-        proposed = refine(problem, replace(fit.state, c=c))
+        solve = memory_or_slip if problem.memory_first else refine
+        proposed = solve(problem, replace(fit.state, c=c))
         lead = _lead(proposed, fit) if _is_solved(proposed) else -np.inf
     except (DatasetError, np.linalg.LinAlgError):
         log.info("calibration: %s released, no solution: refused", names)
@@ -508,7 +528,7 @@ def _with_jumps(dataset, start, decide, bump):
             without = decide(without)
         are_told = (jumps.sigma < UNKNOWN_SIGMA).all()           # by markers
         if without is not None and are_told:
-            is_led = _lead_of_jumps(fit, without) >= MIN_JUMP_LEAD
+            is_led = _lead_of_jumps(fit, without) >= MIN_JUMP_LEAD or _spares_slip(fit, without)
             least = -1 if is_led else found + jumps.causes
             if not spares_sightings(fit, without, "jumps", least):
                 fit = without
@@ -518,6 +538,13 @@ def _with_jumps(dataset, start, decide, bump):
             fit = decide(start(jumps))
     log.info("jumps: %d of %d are believed", len(fit.problem.measurements.jumps.start), found)
     return fit
+
+
+def _spares_slip(fit, other):
+    """Whether another Fit learns a far larger slip than a Fit with jumps."""
+    m = fit.problem.measurements
+    slip = max(fit.problem.noise.slip, TYPICAL_SLIP)
+    return m.learned[0] and other.problem.noise.slip > MIN_SPARED_SLIP * slip
 
 
 def _lead_of_jumps(fit, other):
@@ -588,7 +615,7 @@ def has_rejected_visits(fit: Fit) -> bool:
 
 
 def spares_sightings(fit: Fit | None, other: Fit, explanation: str, least: float) -> bool:
-    """Whether a Fit spares at least so many sightings more than it loses.
+    """Whether a Fit spares at least so many sightings more than it loses, times LOST_WEIGHT.
 
     It spares one that another Fit rejects, and loses one that the other accepts; it may lose hardly
     any. A Fit that learns a far larger slip spares them by this slip, not by its explanation.
@@ -601,7 +628,8 @@ def spares_sightings(fit: Fit | None, other: Fit, explanation: str, least: float
     spared = np.count_nonzero(wrong_without & ~wrong)
     lost = np.count_nonzero(wrong & ~wrong_without)
     slips = fit.problem.noise.slip > max(LARGE_SLIP, MAX_SLIP_RATIO * other.problem.noise.slip)
-    is_believed = spared - lost >= least and lost <= max(1, MAX_LOST * spared) and not slips
+    few_lost = lost <= max(1, MAX_LOST * spared)
+    is_believed = spared - LOST_WEIGHT * lost >= least and few_lost and not slips
     log.info("%s: spare %d sightings, lose %d, slip %.3g mm after 1 m, %.3g without: %s",
              explanation, spared, lost, 1e3 * fit.problem.noise.slip,
              1e3 * other.problem.noise.slip, "believed" if is_believed else "not believed")

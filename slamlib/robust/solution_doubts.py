@@ -8,7 +8,6 @@ import numpy as np
 from slamlib.core import se2
 from slamlib.core.sightings import GATE
 from slamlib.core.vehicle import Vehicle
-from slamlib.robust.choices import LARGE_SLIP
 from slamlib.robust.file_doubts import Doubt
 from slamlib.robust.fused import LearnedFusion
 from slamlib.robust.jumps import UNKNOWN_SIGMA
@@ -187,11 +186,10 @@ def _memory_doubt(result, kind, share):
     """The Doubt on errors with memory, of which measurements keep the shares (m,)."""
     correlation = result.correlation[kind.column - 1]
     return Doubt(f"{kind.doubt}-memory", (
-        f"Errors of successive {kind.name} are alike: the correlation of their residuals is "
-        f"{correlation:.2f}. So {_problem(result)} counts {len(share)} {kind.name} as "
-        f"{share.sum():.0f}, with {result.noise[kind.column]:.2g} times the standard deviations in "
-        f"{kind.file}."), (
-        "Look at the calibration of the sensor, and for what blurs, hides or reflects."))
+        f"Errors of successive {kind.name} are alike: their correlation is {correlation:.2f}. So "
+        f"{_problem(result)} counts {len(share)} {kind.name} as {share.sum():.0f}, with "
+        f"{result.noise[kind.column]:.2g} times the standard deviations in {kind.file}."), (
+        "Look at the calibration of the sensor, and for what moves, blurs, hides or reflects."))
 
 
 def _factor_doubt(result, kind):
@@ -305,15 +303,6 @@ def _slip_doubt(slip):
 
 def _path_doubts(result):
     """Doubts on slip, and a solution that still changed."""
-    if result.fit.problem.memory_first and result.slip < LARGE_SLIP:
-        yield Doubt("camera-shakes", (
-            "Errors of the sensors that change slowly, or alike for all markers of an image, bend "
-            f"the path as a large slip would: {_problem(result)} takes them for errors of the "
-            f"sensors, and finds a slip of {1e3 * result.slip:.0f} mm (one standard deviation) "
-            "after one metre."), (
-            "Look whether the camera tilts or shakes while the vehicle moves. If it is the wheels "
-            "that slip, state their slip in vehicle.toml. The rounding of counts that are "
-            "centimetres apart looks the same."))
     if result.noise_sigma[0]:
         yield from _slip_doubt(result.slip)
     if not result.converged:
