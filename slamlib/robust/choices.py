@@ -96,10 +96,11 @@ MIN_SIGMA = 0.02             # m or rad, of the path between two visits
 def memory_or_slip(problem: Problem, state: State) -> Fit:
     """The Fit of a Problem, near its solution, that explains slow errors by memory, or by slip.
 
-    Slow errors of sensors bend the path as slip does. If errors are independent once the slip is
-    learned, and as large as stated or the slip small, it is slip, or what is found to be wrong on
-    wheels. Else memory is sought first, unless measurements then contradict the path more than with
-    slip. Where it was sought first already, a large slip is not believed.
+    Slow errors of sensors bend the path as slip does. The slip is believed if errors are
+    independent once it is learned, and as large as stated, or if it is small; it may be a wrong
+    statement on wheels, which the calibration finds. Else memory is sought first, and believed
+    unless more measurements then contradict the path than with slip first. In a Problem whose
+    memory was sought first already, no large slip is believed.
     """
     slip_first = replace(problem, memory_first=False)
     fit = refine_without_memory(slip_first, state)
@@ -529,7 +530,7 @@ def _with_jumps(dataset, start, decide, bump):
         are_told = (jumps.sigma < UNKNOWN_SIGMA).all()           # by markers
         if without is not None and are_told:
             is_led = _lead_of_jumps(fit, without) >= MIN_JUMP_LEAD or _spares_slip(fit, without)
-            least = -1 if is_led else found + jumps.causes
+            least = -LOST_WEIGHT if is_led else found + jumps.causes
             if not spares_sightings(fit, without, "jumps", least):
                 fit = without
     elif found:
