@@ -434,12 +434,11 @@ def _likelihood(fit):
     values, axes = np.linalg.eigh(without_prior[block])
     L[block] = axes * np.maximum(values, 0) @ axes.T
     position = equations.structure.rows[len(fit.state.poses) - 1, :2]
-    B = sums.border[:-p, :-1]
-    selected = np.zeros((len(B), 2))
+    selected = np.zeros((len(solution.by_c), 2))
     selected[position] = np.eye(2)
-    covariance = solution.lu.solve(selected)
-    return _Likelihood(L, np.where(known, L @ u - gradient, 0.0),
-                       variance=np.trace(covariance[position]), lever=-covariance.T @ B)
+    covariance = solution.lu.solve(selected)[position]
+    return _Likelihood(L, np.where(known, L @ u - gradient, 0.0), variance=np.trace(covariance),
+                       lever=-solution.by_c[position])
 
 
 def _lead(proposed, present):

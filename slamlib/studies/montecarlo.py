@@ -125,7 +125,7 @@ def correlated_errors(seed: int, correlation: float, **options) -> dict:
     -------
     dict of "nees" and aligned "ate" in m of each method, as "markers nees"; "independent" is
     problem 3 with every sighting counted in full. Also of problem 3 the mean "share" of its
-    information that a sighting keeps, and the "residuals", the correlation of those of neighbours.
+    information that a sighting keeps, and the correlation of neighbours that it finds, "residuals".
     """
     dataset, truth = simulate(seed=seed, memory=correlation, **options)
     markers = localize(dataset.aruco)
