@@ -175,7 +175,7 @@ def test_covariances_are_honest():
     runs = pd.read_csv(ROOT / "notebooks" / "studies" / "memory_0.9.csv", comment="#")
     for method in ("markers", "problem 3", "problem 4"):
         assert 1 < runs[f"{method} nees"].mean() < 5
-    assert (runs["share"] < 1).all() and abs(runs["residuals"].mean() - 0.9) < 0.02
+    assert (runs["share"] < 1).all() and abs(runs["correlation"].mean() - 0.9) < 0.02
     assert runs["independent nees"].mean() > nees_band(len(runs))[1]
 
 

@@ -528,7 +528,7 @@ def _with_jumps(dataset, start, decide, bump):
             without = decide(without)
         are_told = (jumps.sigma < UNKNOWN_SIGMA).all()           # by markers
         if without is not None and are_told:
-            is_led = _lead_of_jumps(fit, without) >= MIN_JUMP_LEAD or _spares_slip(fit, without)
+            is_led = _spares_slip(fit, without) or _lead_of_jumps(fit, without) >= MIN_JUMP_LEAD
             least = -LOST_WEIGHT if is_led else found + jumps.causes
             if not spares_sightings(fit, without, "jumps", least):
                 fit = without

@@ -7,14 +7,15 @@ share 1 / (1 + sum of rho with all others) of its information (the design effect
 Sampling, 1965, section 5.4).
 
 The solution takes over a part of the errors: a marker the mean of its own, the path what is slow.
-So products of errors are not those of residuals. They are expected by the posterior, as in the EM
-algorithm (Dempster, Laird and Rubin, J. Royal Statistical Society B 39(1), 1977): with what an
-error changes by in draws from it,
+So products of residuals are not those of errors. What is expected of these follows from the
+posterior, as in the EM algorithm (Dempster, Laird and Rubin, J. Royal Statistical Society B 39(1),
+1977). If draws from it change the residuals r and r' by v and v', errors u and u' in standard
+deviations have
 
-    mean of u u' = products of the residuals + mean of products of their changes.
+    mean of u u' = mean of r r' + mean of v v'.
 
-A posterior that follows from the shares makes the mean of u^2 near 1, u in standard deviations. Its
-lack, where the model takes over more than it knows, is added to the products at each lag:
+Where shares and noise fit each other, the mean of u^2 is near 1. What it lacks is added at each
+lag, since the solution then takes over more than its posterior says:
 
     rho = mean of u u' + 1 - mean of u^2.
 
@@ -32,7 +33,7 @@ import numpy as np
 
 MAX_LAG = 100                # number of typical intervals over which errors are compared
 MAX_PAUSE = 10               # of these, without a measurement, after which errors are independent
-MIN_CORRELATION = 0.05       # of neighbours' residuals, below which errors are independent
+MIN_CORRELATION = 0.05       # of neighbours' errors, below which errors are independent
 MIN_SIGNIFICANCE = 4.0       # of its standard deviations, the same
 MIN_RHO = 0.05               # below which errors are independent from that lag on
 MIN_VARIANCE = 0.01          # of residuals in their sigmas; smaller ones are no errors of sensors
@@ -70,13 +71,13 @@ def runs(landmark: np.ndarray, pose: np.ndarray, max_pause: float) -> tuple[floa
     return typical, np.cumulative_sum(begins, include_initial=True)
 
 
-def error_memory(landmark: np.ndarray, pose: np.ndarray, u: np.ndarray, changes: np.ndarray,
+def error_memory(landmark: np.ndarray, pose: np.ndarray, r: np.ndarray, changes: np.ndarray,
                  used: np.ndarray, adds_lack: bool = True) -> Memory:
     """The Memory of measurements of `landmark` (m,), rows or ids, at encoder poses (m,).
 
-    u (m, d) are residuals in standard deviations of the errors, `changes` (m, d, k) theirs in draws
-    from the posterior; those not `used` (m,) do not count. `adds_lack` is whether what the mean of
-    u^2 lacks of 1 is added.
+    r (m, d) are residuals in standard deviations of the errors; k draws from the posterior change
+    them by `changes` (m, d, k). Those not `used` (m,) do not count. `adds_lack` is whether what the
+    mean of u^2 lacks of 1 is added.
     """
     rows = np.flatnonzero(used)
     rows = rows[np.lexsort((pose[rows], landmark[rows]))]
@@ -84,8 +85,8 @@ def error_memory(landmark: np.ndarray, pose: np.ndarray, u: np.ndarray, changes:
     none = Memory(correlation=0.0, sigma=1.0, share=share)
     if len(np.unique(landmark[rows])) == len(rows):      # none is measured twice
         return none
-    errors = np.concatenate([u[..., None], changes / np.sqrt(changes.shape[2])], axis=2)[rows]
-    errors = errors.reshape(len(rows), -1) / np.sqrt(u.shape[1])
+    errors = np.concatenate([r[..., None], changes / np.sqrt(changes.shape[2])], axis=2)[rows]
+    errors = errors.reshape(len(rows), -1) / np.sqrt(r.shape[1])
     variance = np.mean(_products(errors, errors))
     if variance < MIN_VARIANCE:
         return none
@@ -93,7 +94,7 @@ def error_memory(landmark: np.ndarray, pose: np.ndarray, u: np.ndarray, changes:
     count = np.bincount(pairs.lag, minlength=MAX_LAG + 1)
     covariance = np.bincount(pairs.lag, pairs.product, MAX_LAG + 1) / np.maximum(count, 1)
     correlation = covariance[1] / variance
-    neighbours = count[1] * u.shape[1]
+    neighbours = count[1] * r.shape[1]
     sigma = 1 / np.sqrt(max(neighbours, 1))
     if correlation >= max(MIN_CORRELATION, MIN_SIGNIFICANCE * sigma):
         rho = covariance + adds_lack * max(0.0, 1 - variance)

@@ -125,14 +125,14 @@ def correlated_errors(seed: int, correlation: float, **options) -> dict:
     -------
     dict of "nees" and aligned "ate" in m of each method, as "markers nees"; "independent" is
     problem 3 with every sighting counted in full. Also of problem 3 the mean "share" of its
-    information that a sighting keeps, and the correlation of neighbours that it finds, "residuals".
+    information that a sighting keeps, and the "correlation" of neighbours that it finds.
     """
     dataset, truth = simulate(seed=seed, memory=correlation, **options)
     markers = localize(dataset.aruco)
     problem3, problem4 = problems_3_and_4(dataset)
     methods = {"markers": markers, "problem 3": problem3, "problem 4": problem4,
                "independent": _counted_in_full(problem3.fit)}
-    numbers = {"share": problem3.share.mean(), "residuals": problem3.correlation[0]}
+    numbers = {"share": problem3.share.mean(), "correlation": problem3.correlation[0]}
     for name, found in methods.items():
         true = truth.poses[markers.frame] if found is markers else truth.poses
         numbers |= judged(name, found.poses, found.covariances, true, aligned=True)
