@@ -387,24 +387,30 @@ def _write_estimated_vehicle(path, vehicle, rows):
 
 
 def inventory_lines(dataset: Dataset, truth: Truth | None) -> list[str]:
-    """A line on what was read of a Dataset and its Truth, and one for each note."""
+    """Lines on what was read of a Dataset and its Truth, what is left out, and each note."""
     sightings = (dataset.aruco or NO_SIGHTINGS).pose
     ranges = (dataset.uwb or NO_RANGES).pose
     truth_is = "unknown" if truth is None else "known"
     lines = [f"{len(dataset.ticks)} poses, {len(sightings)} sightings, {len(ranges)} ranges, "
              f"truth {truth_is}"]
+    for sensor, name in SENSORS.items():
+        if getattr(dataset, sensor) is None:
+            without = [problem for problem, task in PROBLEMS.items() if task.sensor == sensor]
+            lines.append(f"left out, no {name}: {', '.join(without)}")
     notes = dataset.notes + getattr(truth, "notes", ())
     lines += [f"note: {note}" for note in notes]
     return [f"{dataset.name}: {line}" for line in lines]
 
 
-def solve_folder(folder: Path, out: Path, problems: Collection[str] = ()) -> dict:
+def solve_folder(folder: Path | str, out: Path | str, problems: Collection[str] = ()) -> dict:
     """Read the dataset in a folder, solve it into the folder `out`; returns the summary.
 
     What was read is printed to stderr. `problems` are keys of `PROBLEMS`, or none for all that the
     sensors allow. Raises DatasetError if the dataset is malformed or does not allow a problem; then
     there is no summary, as an earlier one may be of other data.
     """
+    folder = Path(folder)
+    out = Path(out)
     is_inside = out.resolve().is_relative_to(folder.resolve())
     if not is_inside:
         with suppress(OSError):
@@ -419,7 +425,7 @@ def solve_folder(folder: Path, out: Path, problems: Collection[str] = ()) -> dic
     return solve_to_folder(dataset, truth, out, problems or PROBLEMS)
 
 
-def solve_folders(folders: Sequence[Path], out: Path | str, jobs: int | None = None,
+def solve_folders(folders: Sequence[Path | str], out: Path | str, jobs: int | None = None,
                   problems: Collection[str] = ()) -> list[dict]:
     """Solve each of several datasets into out/<name>, and write the table out/drives.csv.
 
@@ -439,7 +445,7 @@ def solve_folders(folders: Sequence[Path], out: Path | str, jobs: int | None = N
     from joblib import Parallel, delayed
 
     out = Path(out)
-    folders = [folder for folder in folders if not folder.is_file()]
+    folders = [folder for folder in map(Path, folders) if not folder.is_file()]
     by_name = {Path(abspath(folder)).name: folder for folder in folders}
     require(len(by_name) == len(folders), out,
             "datasets in folders of different names, as which their results are written")

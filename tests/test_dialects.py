@@ -251,9 +251,10 @@ def test_without_guesses_problem_4_is_left_out_with_a_note(folder):
     clean = replace(read_dataset(folder), uwb=None, antenna_guess=None)
     (folder / "UwbAntennaGuess.txt").unlink()
     found = read_dataset(folder)
-    assert_same(found, clean, "UwbAntennaGuess.txt is missing: problem 4 is left out.")
-    assert inventory_lines(found, None)[0] == (
-        "drive: 4 poses, 3 sightings, 0 ranges, truth unknown")
+    assert_same(found, clean, "UwbAntennaGuess.txt is missing: the ranges are left out.")
+    assert inventory_lines(found, None)[:2] == [
+        "drive: 4 poses, 3 sightings, 0 ranges, truth unknown",
+        "drive: left out, no UWB ranges to antennas with a guess: problem4"]
 
 
 # Files of MATLAB.
@@ -434,4 +435,6 @@ def test_what_was_not_found_is_said(folder):
     write(folder / "UwbReading.txt", "# none\n")
     assert inventory_lines(read_dataset(folder), read_truth(folder)) == [
         "drive: 4 poses, 0 sightings, 0 ranges, truth known",
+        "drive: left out, no markers: problem2, problem2_hint, problem2_fused, problem3",
+        "drive: left out, no UWB ranges to antennas with a guess: problem4",
         "drive: note: UwbReading.txt: no rows of numbers."]

@@ -220,7 +220,7 @@ def test_drives_are_solved_on_a_local_dask_cluster(tmp_path, drive):
         write_dataset(folder, drive[0].first(30 * count), None)
 
     def table(out):
-        solve.solve_folders(folders, out, problems=["problem3"])
+        solve.solve_folders(map(str, folders), out, problems=["problem3"])
         return pd.read_csv(out / "drives.csv").drop(columns="seconds")
 
     with (distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None)

@@ -95,7 +95,7 @@ def _dataset(files, vehicle, name, notes=()):
     """The Dataset by its Vehicle and the sources (dict) of its tables by name."""
     if UWB in files and GUESS not in files:
         del files[UWB]
-        notes += (f"{GUESS} is missing: problem 4 is left out.",)
+        notes += (f"{GUESS} is missing: the ranges are left out.",)
     encoders = read_table(files, ENCODER)
     encoders, ticks = _incremental_counts(encoders, vehicle)
     count = len(ticks)
