@@ -132,6 +132,8 @@ def test_a_remark_in_a_link_is_in_the_report_if_its_chapter_is(tmp_path):
     (["$$ a \\tag{1} \\tag{2} $$"], r"pandoc would lose \\tag in this formula"),
     (["$\\begin{array}{c|c} a & b \\end{array}$"], r"pandoc would lose \{array}\{c\| in this"),
     (["\\begin{equation} x \\end{equation}"], r"a formula stands outside of \$\$"),
+    (["For $5: $\\frac{1}{2$."], r"a formula has braces that do not match.*: \$.frac\{1\}\{2\$"),
+    (["Let $ x $ be."], r"or a blank beside its \$: \$"),
     (["[text](#Nowhere)"], "Typst cannot set the PDF: label .*Nowhere")])
 def test_what_would_be_lost_or_leads_nowhere_is_refused(cells, reason):
     with pytest.raises(NotebookError, match=reason):

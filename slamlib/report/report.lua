@@ -161,6 +161,9 @@ local function answer(quote)
 end
 local function outside_of_formula(str)
   if str.text:find "^\\begin{" then refuse("a formula stands outside of $$: " .. str.text) end
+  if str.text == "$" or str.text:find "%$" and str.text:find "[\\{]" then
+    refuse("a formula has braces that do not match, or a blank beside its $: " .. str.text)
+  end
 end
 local function reference(kind, number)
   local id = kind .. "-" .. number
