@@ -107,10 +107,14 @@ def test_what_is_stated_is_what_the_table_says(height, sigma):
         assert_allclose(found, 2 * of_vehicle, rtol=1e-6)
 
 
-def proposed(monkeypatch, vehicle, entries, L, h, variance=1.0):
-    """The proposal for a drive that informs of the sum of these entries (list of int) only."""
+def proposed(monkeypatch, vehicle, entries, L, h, variance=1.0, weight=1.0):
+    """The proposal for a drive that informs of the sum of these entries (list of int) only.
+
+    The last one has a weight in it.
+    """
     stated = calibration.stated_calibration(vehicle, [])
-    of_sum = np.isin(np.arange(len(ENTRIES)), entries)
+    of_sum = np.isin(np.arange(len(ENTRIES)), entries).astype(float)
+    of_sum[entries[-1]] = weight
     likelihood = choices._Likelihood(
         L * np.outer(of_sum, of_sum), h * of_sum, variance, 0.1 * np.tile(of_sum, (2, 1)))
     monkeypatch.setattr(choices, "_likelihood", lambda fit: likelihood)
@@ -132,6 +136,27 @@ def test_what_a_drive_cannot_tell_apart_by_hand(monkeypatch, off, sigma, named):
     assert named <= found.prior.groups
     if sigma == 0 and named:
         assert found.lead == pytest.approx(2500 / 201 - np.log(201) / 2)
+
+
+@pytest.mark.parametrize("weight, is_released", [(1.0, True), (0.2, False)])
+def test_what_is_stated_more_firmly_is_named_but_not_always_released(
+        monkeypatch, weight, is_released):
+    """L = 100 in the size, and 100 w^2 in a delay of a `weight` w: evidence 15.5, and 15.5 or 13.6.
+
+    The delay is stated, so that its prior odds are less by 3: beyond AMBIGUOUS = 4.5 or not.
+    """
+    found = proposed(monkeypatch, Vehicle(sigma_sighting_lag=0.01), [SIZE, SIGHTING_LAG], 100, 60,
+                     weight=weight)
+    assert {*found.explanations} == {frozenset(["marker-size"]), frozenset(["time-offset"])}
+    assert found.prior.groups == {"marker-size", "time-offset"}.difference(
+        set() if is_released else {"time-offset"})
+
+
+def test_what_is_not_worth_its_price_is_no_explanation_beside_another(monkeypatch):
+    """Evidence 8.9 is enough for the size, not for a delay that is stated: by 6 and by 9."""
+    found = proposed(monkeypatch, Vehicle(sigma_sighting_lag=0.01), [SIZE, SIGHTING_LAG], 100, 47.5)
+    assert found.explanations == (frozenset(["marker-size"]),)
+    assert found.prior.groups == {"marker-size"}
 
 
 @pytest.mark.parametrize("h, variance, released", [
@@ -258,7 +283,7 @@ def test_wheels_that_drift_and_markers_are_as_likely_although_the_wheels_are_sta
     dataset, truth = drive(13)
     grown = np.linspace(1, 1.02, len(dataset.ticks))[:, None]
     found = estimate(replace(dataset, uwb=None, ticks=np.rint(grown * dataset.ticks)))
-    assert found.released == {"marker-size", "wheel-radii"}
+    assert {"marker-size", "wheel-radii"} <= found.released
     assert mean_nees(found, truth) < 8
 
 

@@ -116,11 +116,16 @@ def with_noise(found, noise, sigma):
                    noise_sigma=np.broadcast_to(sigma, 3))
 
 
-def explained(found, *explanations, by=None, off=0.01):
-    """The SlamResult with explanations (sets of groups), and an entry that is off its value."""
+def explained(found, *explanations, released=None, by=None, off=0.01):
+    """The SlamResult with explanations (sets of groups), and an entry that is off its value.
+
+    All their groups are released, or those given.
+    """
     c = found.calibration.stated + off * np.isin(found.calibration.names, [by])
-    return replace(found, fit=replace(found.fit, explanations=tuple(map(frozenset, explanations))),
-                   c=c, c_covariance=1e-6 * np.eye(len(c)))
+    prior = found.calibration.prior(released or {group for some in explanations for group in some})
+    fit = replace(found.fit, explanations=tuple(map(frozenset, explanations)),
+                  problem=replace(found.fit.problem, prior=prior))
+    return replace(found, fit=fit, c=c, c_covariance=1e-6 * np.eye(len(c)))
 
 
 def test_nothing_is_said_of_what_agrees(found):
@@ -158,6 +163,14 @@ def test_explanations_that_exclude_each_other_are_all_named(found):
     assert "instead be one factor on both wheels or the place of the UWB tag" in doubt.sentence
     doubt, = solution_doubts(explained(found, ["wheel-radii"], [wheels]))     # equally far off
     assert doubt.what == wheels
+
+
+def test_what_is_stated_speaks_against_an_explanation_that_is_not_released(found):
+    doubt, = solution_doubts(explained(
+        found, ["marker-size"], ["wheel-scale"], released=["marker-size"], by="right_radius"))
+    assert doubt.what == "marker-size"
+    assert "The drive also allows one factor on both wheels, but" in doubt.sentence
+    assert "instead" not in doubt.sentence
 
 
 @pytest.mark.parametrize("column, name, file", [

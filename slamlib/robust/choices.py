@@ -64,7 +64,7 @@ DECISIVE_RELEASE = 6.0       # log evidence by which a group is told to be wrong
 FURTHER_ENTRY = 0.5          # log evidence beside it, for each entry of a group but the first
 STATED = 3.0                 # log evidence beside it, if standard deviations are stated
 ANY_MOMENT = 6.0             # log evidence beside it, for what may happen at any moment
-AMBIGUOUS = 3.0              # log evidence within which explanations cannot be told apart
+AMBIGUOUS = 4.5              # log evidence within which explanations cannot be told apart
 MAX_GROUPS = 5               # number of groups that are wrong at once
 MAX_WIDE_SIGMAS = 4.0        # wide sigmas, of an entry; beyond them a statement is grossly wrong
 GROSS = 10.0                 # factor on the wide sigmas beyond MAX_WIDE_SIGMAS
@@ -210,7 +210,8 @@ def _confirmed(fit):
         needed = sum(_price(m.calibration, group) for group in some - m.jumps.groups)
         if fit.lead >= needed:
             confirmed.append(some)
-    return tuple(confirmed) or (frozenset(),)
+    is_released = any(some <= fit.problem.prior.groups for some in confirmed)
+    return tuple(confirmed) if is_released else (frozenset(),)
 
 
 class _Proposal(NamedTuple):
@@ -273,10 +274,10 @@ def _proposal(fit):
     """The _Proposal of the groups of the calibration of a Fit that the evidence wants released.
 
     `explanations` are the best set of groups and others that the drive cannot tell from it, neither
-    part of it nor more. The prior releases all their groups, and what else raises the evidence: not
-    certain enough to be told, but the covariances include it, unless the last position would be far
-    less certain. Wide standard deviations are multiplied by GROSS if an entry that is released
-    would be further off than MAX_WIDE_SIGMAS.
+    part of it nor more. The prior releases all groups that are likely, and what else raises the
+    evidence: not certain enough to be told, but the covariances include it, unless the last
+    position would be far less certain. Wide standard deviations are multiplied by GROSS if an entry
+    that is released would be further off than MAX_WIDE_SIGMAS.
     """
     calibration = fit.problem.measurements.calibration
     likelihood = _likelihood(fit)
@@ -286,9 +287,9 @@ def _proposal(fit):
         best = sets.groups[k]
         if not best or sets.furthest[k] < MAX_WIDE_SIGMAS:
             break
-    told = _as_likely(sets, k)
+    likely, told = _as_likely(sets, k)
     explanations = tuple(some for some in told if not (some < best or some > best))
-    k = _released_set(sets, certain=frozenset().union(*told), default=k)
+    k = _released_set(sets, certain=frozenset().union(*likely), default=k)
     root = _in_wide_sigmas(calibration, likelihood.L, fit.problem.prior.root)
     present = _posterior(likelihood, root)[0]
     return _Proposal(explanations, sets.priors[k], sets.evidence[k] - present)
@@ -336,20 +337,29 @@ def _sets(calibration, likelihood, width):
 
 
 def _as_likely(sets, best):
-    """List of the groups of _Sets that the drive cannot tell from number `best`, which is one.
+    """Those of the _Sets that the drive cannot tell from number `best`, which is one of them.
 
-    They come within AMBIGUOUS of it. So does one more, whatever standard deviations are stated: the
-    best of the others of which each group is worth its price.
+    In each of them every group is worth its price.
+
+    Returns
+    -------
+    list of groups, which come within AMBIGUOUS of it, and the list with one more, if there is one
+        that would come so near whatever standard deviations are stated. What the drive cannot tell
+        is decided by how firmly it was stated.
     """
     first = sets.groups[best]
     merit = dict(zip(sets.groups, sets.merit))
-    likely = compress(sets.groups, sets.merit > sets.merit[best] - AMBIGUOUS)
-    likelihood = sets.merit + sets.surprise
-    others = [some for some in compress(sets.groups, likelihood > likelihood[best] - AMBIGUOUS)
-              if not (some <= first or some > first)
-              and all(merit[some] > merit[some - {group}] for group in some)]
+    of_worth = np.array([all(merit[some] >= merit[some - {group}] for group in some)
+                         for some in sets.groups])
+
+    def near(merits):
+        return list(compress(sets.groups, of_worth & (merits > merits[best] - AMBIGUOUS)))
+
+    likely = near(sets.merit)
+    others = [some for some in near(sets.merit + sets.surprise)
+              if some not in likely and not (some <= first or some > first)]
     others.sort(key=merit.get)
-    return [*likely, *others[-1:]]
+    return likely, likely + others[-1:]
 
 
 def _in_wide_sigmas(calibration, L, roots):

@@ -71,7 +71,7 @@ def solution_doubts(result: SlamResult) -> tuple[Doubt, ...]:
 def _calibration_doubts(result):
     """A Doubt on each group of the calibration that decidedly left its stated values.
 
-    Of groups that the drive cannot tell apart, on that which is furthest from what is stated.
+    Of groups that the drive cannot tell apart, on that which has left it furthest.
     """
     common = frozenset.intersection(*result.explanations)
     of_any = frozenset().union(*result.explanations)
@@ -85,7 +85,8 @@ def _calibration_doubts(result):
     def distance(group):
         return max(map(sigmas_off, rows[group]))
 
-    furthest = max(either, key=distance, default=None)
+    released = [group for group in either if group in result.released]
+    furthest = max(released, key=distance, default=None)
     for group, (_, advice) in GROUPS.items():
         if group not in common and group != furthest:
             continue
@@ -95,9 +96,14 @@ def _calibration_doubts(result):
         if group == "camera-bump":
             sentence = f"From pose {result.jumps.bump + 1} on the camera is elsewhere. {sentence}"
         if group == furthest:
-            others = [GROUPS[other][0] for other in either if other != group]
-            sentence += (f" It may instead be {' or '.join(others)}: the drive cannot tell, and "
-                         "the covariances include it.")
+            instead = [GROUPS[other][0] for other in released if other != group]
+            against = [GROUPS[other][0] for other in either if other not in released]
+            if instead:
+                sentence += (f" It may instead be {' or '.join(instead)}: the drive cannot tell, "
+                             "and the covariances include it.")
+            if against:
+                sentence += (f" The drive also allows {' or '.join(against)}, but what "
+                             "vehicle.toml states speaks against it.")
         yield Doubt(group, sentence, advice)
 
 
