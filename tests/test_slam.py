@@ -256,7 +256,7 @@ def test_noise_of_turns_does_not_make_the_wheelbase_long(monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize("legs, every, seed, radii, named", [
     ([(30, 0.6), (30, -1.0), (30, 0.5)], 10, 7116, (0.102, 0.102),
-     {"wheel-scale", "marker-size"}),                    # which the drive cannot tell apart
+     {"wheel-scale", "wheel-radii", "marker-size"}),     # which the drive cannot tell apart
     ([(150, 0)], 24, 7110, (0.101, 0.1), {"wheel-radii"})])
 def test_wrong_wheels_on_a_long_way_are_neither_jumps_nor_memory(
         legs, every, seed, radii, named, monkeypatch):
