@@ -343,9 +343,9 @@ def _as_likely(sets, best):
 
     Returns
     -------
-    list of groups, which come within AMBIGUOUS of it, and the list with one more, if there is one
-        that would come so near whatever standard deviations are stated. What the drive cannot tell
-        is decided by how firmly it was stated.
+    list of groups, of those within AMBIGUOUS of the best.
+    list of groups, of these and one more: the best of those within AMBIGUOUS but for what a stated
+        standard deviation costs. It is told, but what was stated more firmly is kept.
     """
     first = sets.groups[best]
     merit = dict(zip(sets.groups, sets.merit))
