@@ -78,9 +78,6 @@ MIN_JUMP_LEAD = 10.0         # log evidence by which a jump found at the solutio
 
 LARGE_SLIP = 0.01            # sqrt(m), from which on slow errors of sensors may be the cause
 AS_STATED = 1.25             # ratio of sigmas, within which errors are as large as stated
-PLAUSIBLE_FACTOR = 3.0       # on standard deviations, beyond which a sensor is not believed slow
-MAX_CONTRADICTING = 0.02     # share of the measurements that may contradict slow errors
-MAX_RATIO_CONTRADICTING = 2.0    # of this share over that by slip, above which it is slip
 
 VISIT_GAP = 30               # typical intervals between sightings of a marker, that end a visit
 MIN_VISIT = 3                # number of accepted sightings of a visit that is compared
@@ -98,9 +95,9 @@ def memory_or_slip(problem: Problem, state: State) -> Fit:
 
     Slow errors of sensors bend the path as slip does. The slip is believed if errors are
     independent once it is learned, and as large as stated, or if it is small; it may be a wrong
-    statement on wheels, which the calibration finds. Else memory is sought first, and believed
-    unless more measurements then contradict the path than with slip first. In a Problem whose
-    memory was sought first already, no large slip is believed.
+    statement on wheels, which the calibration finds. Else memory is sought first; where wheels do
+    slip, this finds the slip, too. In a Problem whose memory was sought first already, no large
+    slip is believed.
     """
     slip_first = replace(problem, memory_first=False)
     fit = refine_without_memory(slip_first, state)
@@ -111,28 +108,7 @@ def memory_or_slip(problem: Problem, state: State) -> Fit:
         is_believed &= slip < LARGE_SLIP
     if is_believed and not has_memory(fit):
         return fit
-    by_memory = refine(replace(problem, memory_first=True), state)
-    if _contradicting_share(by_memory) <= MAX_CONTRADICTING:
-        return by_memory
-    by_slip = refine(slip_first, state)
-    return by_memory if _is_as_good(by_memory, by_slip) else by_slip
-
-
-def _is_as_good(by_memory, by_slip):
-    """Whether hardly more measurements contradict one Fit than the other."""
-    share = _contradicting_share(by_memory)
-    share_by_slip = _contradicting_share(by_slip)
-    log.info("memory first: slip %.3g mm after 1 m, %.1f %% contradict; slip first: %.3g mm, "
-             "%.1f %%", 1e3 * by_memory.problem.noise.slip, 100 * share,
-             1e3 * by_slip.problem.noise.slip, 100 * share_by_slip)
-    return share <= max(MAX_CONTRADICTING, MAX_RATIO_CONTRADICTING * share_by_slip)
-
-
-def _contradicting_share(fit):
-    """Share of all measurements that a Fit rejects with PLAUSIBLE_FACTOR as its noise."""
-    noise = fit.problem.noise._replace(sightings=PLAUSIBLE_FACTOR, ranges=PLAUSIBLE_FACTOR)
-    accepted = accepted_measurements(replace(fit.problem, noise=noise), fit.state)
-    return np.mean(np.concatenate([kind.weight for kind in accepted]) == 0)
+    return refine(replace(problem, memory_first=True), state)
 
 
 def without_large_slip(
@@ -141,8 +117,7 @@ def without_large_slip(
     """What `most_consistent` finds, decided anew with memory first if the slip is large.
 
     An error that all markers of an image share, as where the camera tilts, bends the path as slip
-    does, and so does a wrong statement on wheels, until it is found. Where wheels do slip, memory
-    first finds it, too.
+    does, and so does a wrong statement on wheels, until it is found.
     """
     found = most_consistent(dataset, start, decide)
     problem = found[0].problem
@@ -150,10 +125,9 @@ def without_large_slip(
     if problem.memory_first or not is_large:
         return found
     try:
-        other = most_consistent(dataset, partial(start, memory_first=True), decide)
+        return most_consistent(dataset, partial(start, memory_first=True), decide)
     except (DatasetError, np.linalg.LinAlgError):
         return found
-    return other if _is_as_good(other[0], found[0]) else found
 
 
 def better_model(fit: Fit) -> Fit:
