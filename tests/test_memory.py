@@ -16,10 +16,10 @@ from slamlib.core.vehicle import TABLE_2
 from slamlib.robust.choices import _squared_distance, visits
 from slamlib.robust.error_memory import error_memory
 from slamlib.robust.fit import error_memories, narrow_kernels, refine
+from slamlib.robust.initialization import initial_state
 from slamlib.robust.linear import build_problem
 from slamlib.robust.measurements import Noise, measure
 from slamlib.robust.noise import with_least_slip
-from slamlib.robust.pipeline import fit_from_odometry
 from slamlib.robust.solution_doubts import solution_doubts
 from slamlib.studies.montecarlo import antenna_error
 
@@ -143,10 +143,9 @@ def test_a_camera_that_shakes_is_no_slip():
 def test_slip_first_or_memory_first_end_alike(options, correlation, slip):
     """Starts are wrong for one of them; the errors that the posterior expects lead to the truth."""
     measurements = measure(short(2, **options)[0].without("uwb"))
-    either = [fit_from_odometry(measurements, memory_first=True)]
-    problem = either[0].problem
-    state = narrow_kernels(build_problem(measurements, "arc"), either[0].state)
-    either.append(refine(replace(problem, memory_first=False, noise=Noise()), state))
+    problem = build_problem(measurements, "arc")
+    state = narrow_kernels(problem, initial_state(measurements, "arc"))
+    either = [refine(replace(problem, memory_first=first), state) for first in (True, False)]
     for fit in either:
         found = error_memories(fit.problem, fit.state, fit.problem.accepted)[0]
         assert found.correlation == pytest.approx(correlation, abs=0.04)

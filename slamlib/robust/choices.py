@@ -38,6 +38,7 @@ from slamlib.robust.calibration import RADII, SCALE, SIZE, WHEEL_SCALE, WHEELS, 
 from slamlib.robust.error_memory import runs
 from slamlib.robust.factors import odometry_error, preintegrate_odometry
 from slamlib.robust.fit import (
+    ROUGH,
     Fit,
     accepted_measurements,
     has_memory,
@@ -53,7 +54,8 @@ from slamlib.robust.linear import (
     laplace_approximation,
     linear_solution,
 )
-from slamlib.robust.measurements import AcceptedMeasurements
+from slamlib.robust.measurements import AcceptedMeasurements, Noise
+from slamlib.robust.optimize import optimize
 from slamlib.robust.part_faults import camera_bump
 from slamlib.robust.result import slam_result
 
@@ -76,8 +78,11 @@ MAX_COST = 1.5               # ratio of sigmas of the last position, by what is 
 MIN_SPARED_SLIP = 4.0        # ratio of the slips without and with jumps that are believed
 MIN_JUMP_LEAD = 10.0         # log evidence by which a jump found at the solution is believed
 
-LARGE_SLIP = 0.01            # sqrt(m), from which on slow errors of sensors may be the cause
+SMALL_SLIP = 1.25e-3         # sqrt(m), above which slow errors of sensors may be the cause
 AS_STATED = 1.25             # ratio of sigmas, within which errors are as large as stated
+BLOCKS = 12                  # parts of the drive, of which every second one is predicted
+FAR_BETTER = 1.5             # ratio of mean costs of predictions, by which a large slip is believed
+LARGE_SLIP = 0.01            # sqrt(m), which is implausible of wheels
 
 VISIT_GAP = 30               # typical intervals between sightings of a marker, that end a visit
 MIN_VISIT = 3                # number of accepted sightings of a visit that is compared
@@ -93,41 +98,56 @@ MIN_SIGMA = 0.02             # m or rad, of the path between two visits
 def memory_or_slip(problem: Problem, state: State) -> Fit:
     """The Fit of a Problem, near its solution, that explains slow errors by memory, or by slip.
 
-    Slow errors of sensors bend the path as slip does. The slip is believed if errors are
-    independent once it is learned, and as large as stated, or if it is small; it may be a wrong
-    statement on wheels, which the calibration finds. Else memory is sought first; where wheels do
-    slip, this finds the slip, too. In a Problem whose memory was sought first already, no large
-    slip is believed.
+    Slow errors of sensors bend the path as slip does. A learned slip explains them only if errors
+    are independent then, and as large as stated unless it is small. Where this slip is not small
+    the errors may be slow all the same: the better prediction decides, and for a large one it must
+    be far better. Memory first finds the slip of wheels, too, but not always wrong statements on
+    them.
     """
-    slip_first = replace(problem, memory_first=False)
-    fit = refine_without_memory(slip_first, state)
-    slip, *factors = fit.problem.noise
+    by_slip = refine_without_memory(replace(problem, memory_first=False), state)
+    slip, *factors = by_slip.problem.noise
+    is_small = slip < SMALL_SLIP or not problem.measurements.learned[0]
     is_as_stated = np.abs(np.log(factors)).max() < np.log(AS_STATED)
-    is_believed = slip < AS_STATED * TYPICAL_SLIP or is_as_stated
-    if problem.memory_first:
-        is_believed &= slip < LARGE_SLIP
-    if is_believed and not has_memory(fit):
-        return fit
-    return refine(replace(problem, memory_first=True), state)
+    explains = (is_small or is_as_stated) and not has_memory(by_slip)
+    if explains and is_small:
+        return by_slip
+    by_memory = refine(replace(problem, memory_first=True), state)
+    if not explains:
+        return by_memory
+    if (by_memory.problem.accepted.share == 1).all():
+        return by_slip
+    cost = _prediction_cost(by_memory)
+    cost_by_slip = _prediction_cost(by_slip)
+    log.info("prediction: cost %.3g by memory and a slip of %.3g mm after 1 m, %.3g by %.3g mm",
+             cost, 1e3 * by_memory.problem.noise.slip, cost_by_slip, 1e3 * slip)
+    needed = FAR_BETTER if slip >= LARGE_SLIP else 1.0
+    return by_slip if needed * cost_by_slip < cost else by_memory
 
 
-def without_large_slip(
-        dataset: Dataset, start: Callable[..., Fit],
-        decide: Callable[[Fit], Fit]) -> tuple[Fit, np.ndarray | None]:
-    """What `most_consistent` finds, decided anew with memory first if the slip is large.
+def _prediction_cost(fit):
+    """Mean robust cost, in stated sigmas, of measurements that a Fit predicts without them.
 
-    An error that all markers of an image share, as where the camera tilts, bends the path as slip
-    does, and so does a wrong statement on wheels, until it is found.
+    Of BLOCKS parts of the drive every second one is left out, then the others (cross-validation).
+    Measurements of landmarks that are measured only there are not predicted.
     """
-    found = most_consistent(dataset, start, decide)
-    problem = found[0].problem
-    is_large = problem.measurements.learned[0] and problem.noise.slip >= LARGE_SLIP
-    if problem.memory_first or not is_large:
-        return found
-    try:
-        return most_consistent(dataset, partial(start, memory_first=True), decide)
-    except (DatasetError, np.linalg.LinAlgError):
-        return found
+    m = fit.problem.measurements
+    block = np.arange(len(m.frame)) * BLOCKS // len(m.frame)
+    of_kinds = (m.sightings.row, m.marker_row), (m.ranges.row, m.ranges.antenna)
+    squared = []
+    for parity in (0, 1):
+        accepted = []
+        predicted = []
+        for kind, (row, landmark) in zip(fit.problem.accepted, of_kinds):
+            left_out = block[row] % 2 == parity
+            rest = np.where(left_out, 0.0, kind.weight)
+            accepted.append(replace(kind, weight=rest))
+            predicted.append(left_out & np.isin(landmark, landmark[rest > 0]))
+        problem = replace(fit.problem, accepted=AcceptedMeasurements(*accepted))
+        state = optimize(problem, fit.state, tolerance=ROUGH).state
+        sightings, ranges = residuals(replace(problem, noise=Noise()), state)
+        squared += [np.sum(sightings[predicted[0]]**2, axis=1), ranges[predicted[1]]**2]
+    costs = np.log1p(np.concatenate(squared) / GATE)
+    return costs.sum() / max(len(costs), 1)
 
 
 def better_model(fit: Fit) -> Fit:

@@ -20,7 +20,6 @@ from slamlib.robust.choices import (
     calibrated,
     memory_or_slip,
     most_consistent,
-    without_large_slip,
 )
 from slamlib.robust.fit import CAUCHY_SCALES, Fit, narrow_kernels, refine, settled
 from slamlib.robust.initialization import initial_state, state_from_poses
@@ -84,14 +83,14 @@ def estimate(dataset: Dataset, slip: float | None = None, model: str | None = No
     dataset = dataset.stating(options, "estimate")
     log.info("estimate of %s: %d poses", dataset.name, len(dataset.ticks))
 
-    def start(jumps=NO_JUMPS, places=None, like=None, memory_first=False):
+    def start(jumps=NO_JUMPS, places=None, like=None):
         aruco = dataset.aruco
         if places is not None:
             aruco = replace(aruco, marker=places[:, 1])
         measurements = measure(replace(dataset, aruco=aruco), poses, jumps)           # 1
         if previous is not None and like is None:
             return fit_from_previous(measurements, previous, model)
-        return fit_from_odometry(measurements, model or "arc", like, memory_first)    # 2 to 6
+        return fit_from_odometry(measurements, model or "arc", like)                  # 2 to 6
 
     def decide(fit):                                                                  # 6
         if previous is not None or model is not None:
@@ -101,9 +100,7 @@ def estimate(dataset: Dataset, slip: float | None = None, model: str | None = No
         other = better_model(fit) if fit.problem.prior.groups else fit
         return fit if other is fit else calibrated(other)
 
-    if previous is None:
-        fit, places = without_large_slip(dataset, start, decide)
-    elif len(previous.rejected):
+    if previous is not None and len(previous.rejected):
         fit = decide(start(previous.jumps, previous.places))
         places = previous.places
     else:
@@ -130,19 +127,17 @@ def require_same_drive(dataset: Dataset, previous: SlamResult | None):
 
 
 def fit_from_odometry(measurements: Measurements, model: str = "arc",
-                      like: Fit | None = None, memory_first: bool = False) -> Fit:
+                      like: Fit | None = None) -> Fit:
     """The Fit of Measurements with start values by odometry; raises DatasetError as `estimate`.
 
     `like` is a Fit whose decisions it takes over: the model of the steps, groups of the calibration
-    with their explanations, and the order of memory. Without it, memory may be sought first.
+    with their explanations, and the order of memory.
     """
     if like is not None:
         model = like.problem.odometry.model
     problem = build_problem(measurements, model)                                      # 2
     state = narrow_kernels(problem, initial_state(measurements, model))               # 4, 5
-    if like is None and memory_first:                                                 # 6
-        return refine(replace(problem, memory_first=True), state)
-    if like is None:
+    if like is None:                                                                  # 6
         return memory_or_slip(problem, state)
     decided = like.problem
     problem = replace(problem, prior=decided.prior, memory_first=decided.memory_first)
