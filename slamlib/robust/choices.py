@@ -78,10 +78,11 @@ MAX_COST = 1.5               # ratio of sigmas of the last position, by what is 
 MIN_SPARED_SLIP = 4.0        # ratio of the slips without and with jumps that are believed
 MIN_JUMP_LEAD = 10.0         # log evidence by which a jump found at the solution is believed
 
-SMALL_SLIP = 1.25e-3         # sqrt(m), above which slow errors of sensors may be the cause
+SMALL_SLIP = 2e-3            # sqrt(m), above which slow errors of sensors may be the cause
 AS_STATED = 1.25             # ratio of sigmas, within which errors are as large as stated
 BLOCKS = 12                  # parts of the drive, of which every second one is predicted
-FAR_BETTER = 1.5             # ratio of mean costs of predictions, by which a large slip is believed
+BETTER = 1.15                # ratio of mean costs of predictions, by which a slip is believed
+FAR_BETTER = 1.5             # the same, of a large slip
 LARGE_SLIP = 0.01            # sqrt(m), which is implausible of wheels
 
 VISIT_GAP = 30               # typical intervals between sightings of a marker, that end a visit
@@ -100,9 +101,8 @@ def memory_or_slip(problem: Problem, state: State) -> Fit:
 
     Slow errors of sensors bend the path as slip does. A learned slip explains them only if errors
     are independent then, and as large as stated unless it is small. Where this slip is not small
-    the errors may be slow all the same: the better prediction decides, and for a large one it must
-    be far better. Memory first finds the slip of wheels, too, but not always wrong statements on
-    them.
+    the errors may be slow all the same: it is believed only if it predicts better, and a large one
+    far better. Memory first finds the slip of wheels, too, but not always wrong statements on them.
     """
     by_slip = refine_without_memory(replace(problem, memory_first=False), state)
     slip, *factors = by_slip.problem.noise
@@ -120,7 +120,7 @@ def memory_or_slip(problem: Problem, state: State) -> Fit:
     cost_by_slip = _prediction_cost(by_slip)
     log.info("prediction: cost %.3g by memory and a slip of %.3g mm after 1 m, %.3g by %.3g mm",
              cost, 1e3 * by_memory.problem.noise.slip, cost_by_slip, 1e3 * slip)
-    needed = FAR_BETTER if slip >= LARGE_SLIP else 1.0
+    needed = FAR_BETTER if slip >= LARGE_SLIP else BETTER
     return by_slip if needed * cost_by_slip < cost else by_memory
 
 
