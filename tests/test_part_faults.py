@@ -18,7 +18,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from slamlib import estimate, fuse
 from slamlib.core import se2
 from slamlib.core.vehicle import Vehicle
-from slamlib.robust.jumps import frozen_rows
+from slamlib.robust.jumps import find_jumps, frozen_rows
 from slamlib.robust.part_faults import camera_bump, slipping_rows
 from slamlib.robust.solution_doubts import fusion_doubts, solution_doubts
 
@@ -111,6 +111,27 @@ def test_a_camera_that_is_moved_and_put_back_is_no_two_jumps():
     z = dataset.aruco.marker_in_vehicle
     found = estimate(aruco(dataset, marker_in_vehicle=se2.compose(moved, z)).without("uwb"))
     assert aligned_ate(found, truth) < 0.01 and not len(found.jumps.start)
+
+
+@pytest.mark.parametrize("poses, motion", [
+    (range(800, 960), [0.1, 0.05, 0.1]),         # two jumps, which are no inverse motions
+    (range(800, 920), [0.5, 0.3, 0.7])])         # jumps all the way
+def test_frames_of_a_camera_that_hangs_elsewhere_are_left_out(poses, motion):
+    dataset, truth = short(4)
+    moved = np.isin(dataset.aruco.pose, poses)[:, None] * motion
+    z = se2.compose(moved, dataset.aruco.marker_in_vehicle)
+    found = estimate(aruco(dataset, marker_in_vehicle=z).without("uwb"))
+    assert not len(found.jumps.start) and mean_nees(found, truth) < 6
+    assert aligned_ate(found, truth) < 0.01
+    assert [doubt.what for doubt in solution_doubts(found)] == ["sightings-rejected"]
+
+
+def test_two_spikes_of_a_wheel_are_no_motion_of_the_camera():
+    """They would cancel as such, but between them the vehicle moved on."""
+    dataset, _ = short(4)
+    spikes = counts(slice(1000, 1001), lambda ticks: ticks + [800, 0])(dataset)
+    spikes = counts(slice(1060, 1061), lambda ticks: ticks - [800, 0])(spikes)
+    assert len(find_jumps(spikes).start) == 2
 
 
 def test_a_jump_among_many_wrong_labels_is_found():

@@ -48,7 +48,8 @@ MIN_MISSED = 6               # number of sightings that should be there, and are
 # Jumps in odometry
 USUAL = 0.9                  # probability of the quantile of motions that is a usual one
 MIN_JUMP = 0.1               # m and rad, least standard deviation of the motion
-MAX_BAD_FRAMES = 10          # in a row
+MAX_BAD_FRAMES = 10          # in a row, or
+MAX_BAD_SHARE = 0.15         # of all frames, if these are more
 CANCELLED = 0.3              # of jumps before and after them, size of all together
 MAX_UNSUPPORTED = 2          # number of jumps; sensors that have more of them may be poor
 UNKNOWN_SIGMA = np.array([10.0, 10.0, np.pi])  # m, m, rad, if no marker tells
@@ -268,7 +269,7 @@ def _found(ticks, s, drive, slipping):
         tried = _bridged(s, drive, suspects, rank, unknown)
     found = [jump for jump in tried if jump.found]
     has_spike = _rows_in_steps(_spikes(ticks), s.frame) > 0
-    return _without_bad_frames(drive, found + _beside(s, drive, found, rank), has_spike)
+    return _without_bad_frames(s, drive, found + _beside(s, drive, found, rank), has_spike)
 
 
 def _beside(s, drive, found, rank):
@@ -280,35 +281,60 @@ def _beside(s, drive, found, rank):
     return [jump for jump in _bridged(s, moved, beside, rank, {}) if jump.found]
 
 
-def _without_bad_frames(drive, found, has_spike):
+def _without_bad_frames(s, drive, found, has_spike):
     """The _Jumps but those that soon cancel: in between, sightings are wrong, or late.
 
     Jumps of which the last one is in a step with a spike of the counts stay; `has_spike` is a mask
     (f-1,).
     """
+    most = max(MAX_BAD_FRAMES, MAX_BAD_SHARE * len(drive.poses))
     kept = []
     for jump in sorted(found, key=attrgetter("step")):
         kept.append(jump)
         if has_spike[jump.step]:
             continue
         for k in reversed(range(len(kept) - 1)):
-            if jump.step - kept[k].step > MAX_BAD_FRAMES:
+            if jump.step - kept[k].step > most:
                 break
-            if _cancel(drive, kept[k:]):
+            if _cancel(s, drive, kept[k:]):
                 del kept[k:]
                 break
     return kept
 
 
-def _cancel(drive, run):
-    """Whether _Jumps move what follows by far less than each of them does."""
+def _cancel(s, drive, run):
+    """Whether _Jumps move what follows by far less than the first and the last of them do.
+
+    Two jumps also cancel as motions of the camera, which is then where it was before, unless
+    markers seen before and after them say that the vehicle is elsewhere.
+    """
     first = run[0].step
     last = run[-1].step + 1
     moved = reduce(_Drive.with_jump, run, drive)
     off = se2.between(se2.between(drive.poses[first], drive.poses[last]),
                       se2.between(moved.poses[first], moved.poses[last]))
-    least = min(size_of(jump.motion) for jump in run)
-    return size_of(off) < CANCELLED * least
+    motions = [jump.motion for jump in (run[0], run[-1])]
+    most = CANCELLED * min(map(size_of, motions))
+    if size_of(off) < most:
+        return True
+    if len(run) > 2 or size_of(se2.compose(*motions)) >= most:
+        return False
+    return _cost_across(s, drive, first, last) <= _cost_across(s, moved, first, last)
+
+
+def _cost_across(s, drive, first, last):
+    """Cost of the sightings of each marker up to a frame, and from another one on, by a _Drive.
+
+    Those nearest to the two frames, of Sightings sorted by marker, then by frame.
+    """
+    earlier = np.flatnonzero(s.row <= first)
+    later = np.flatnonzero(s.row >= last)[::-1]
+    before = dict(zip(s.marker[earlier].tolist(), earlier))
+    after = dict(zip(s.marker[later].tolist(), later))
+    both = sorted(before.keys() & after.keys())
+    k = np.array([before[marker] for marker in both], int)
+    seen_later = drive.seen_from(s.row[k], s, np.array([after[marker] for marker in both], int))
+    return _cost(_Motions(s.z[k], s.C[k]).squared_distances(seen_later)).sum()
 
 
 def _covariance_scale(s, drive):
