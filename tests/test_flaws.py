@@ -235,6 +235,13 @@ def test_a_fusion_that_contradicts_problem_3_is_told_with_distance_and_share():
     assert "up to 0.05 m from problem 3, and at 50% of the poses" in doubt.sentence
 
 
+def test_a_vehicle_that_stands_is_no_contradiction():
+    """Of what its counts say nothing else is known: both poses are pose 1 to rounding."""
+    poses = np.full((10, 3), 1e-6)
+    assert not contradiction_doubts(poses, np.tile(1e-20 * np.eye(3), (10, 1, 1)), 0 * poses)
+
+
+
 def test_markers_of_one_accepted_sighting_or_at_the_place_of_another_are_unconfirmed(found):
     """The latter as of wrong labels, if they are seen less often. The summary names them."""
     marker, count = np.unique(found.sightings.marker, return_counts=True)

@@ -50,7 +50,7 @@ USUAL = 0.9                  # probability of the quantile of motions that is a 
 MIN_JUMP = 0.1               # m and rad, least standard deviation of the motion
 MAX_BAD_FRAMES = 10          # in a row, or
 MAX_BAD_SHARE = 0.15         # of all frames, if these are more
-CANCELLED = 0.3              # of jumps before and after them, size of all together
+CANCELLED = 0.3              # ratio of the size of all jumps together to that of one
 MAX_UNSUPPORTED = 2          # number of jumps; sensors that have more of them may be poor
 UNKNOWN_SIGMA = np.array([10.0, 10.0, np.pi])  # m, m, rad, if no marker tells
 SPIKE = 3.0                  # ratio to the counts of fast steps, above which a step is the jump
@@ -287,26 +287,29 @@ def _without_bad_frames(s, drive, found, has_spike):
     Jumps of which the last one is in a step with a spike of the counts stay; `has_spike` is a mask
     (f-1,).
     """
-    most = max(MAX_BAD_FRAMES, MAX_BAD_SHARE * len(drive.poses))
-    kept = []
-    for jump in sorted(found, key=attrgetter("step")):
-        kept.append(jump)
-        if has_spike[jump.step]:
-            continue
-        for k in reversed(range(len(kept) - 1)):
-            if jump.step - kept[k].step > most:
-                break
-            if _cancel(s, drive, kept[k:]):
-                del kept[k:]
-                break
+    kept = sorted(found, key=attrgetter("step"))
+    for most in (MAX_BAD_FRAMES, MAX_BAD_SHARE * len(drive.poses)):      # the nearest first
+        jumps = kept
+        kept = []
+        for jump in jumps:
+            kept.append(jump)
+            if has_spike[jump.step]:
+                continue
+            for k in reversed(range(len(kept) - 1)):
+                if jump.step - kept[k].step > most:
+                    break
+                if _cancel(s, drive, kept[k:]):
+                    del kept[k:]
+                    break
     return kept
 
 
 def _cancel(s, drive, run):
     """Whether _Jumps move what follows by far less than the first and the last of them do.
 
-    Two jumps also cancel as motions of the camera, which is then where it was before, unless
-    markers seen before and after them say that the vehicle is elsewhere.
+    Two jumps also cancel as motions of the camera, which is then where it was before (within
+    CANCELLED m and rad), unless markers seen before and after them say that the vehicle is
+    elsewhere.
     """
     first = run[0].step
     last = run[-1].step + 1
@@ -317,7 +320,7 @@ def _cancel(s, drive, run):
     most = CANCELLED * min(map(size_of, motions))
     if size_of(off) < most:
         return True
-    if len(run) > 2 or size_of(se2.compose(*motions)) >= most:
+    if len(run) > 2 or size_of(se2.compose(*motions)) >= min(most, CANCELLED):
         return False
     return _cost_across(s, drive, first, last) <= _cost_across(s, moved, first, last)
 

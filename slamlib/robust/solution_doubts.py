@@ -17,6 +17,7 @@ from slamlib.robust.result import SlamResult
 MAX_GAP = 30                 # poses, between contradictions that are told as one
 MAX_SLIP = 0.02              # sqrt(m), of wheels on the ground
 MIN_CONTRADICTING = 0.05     # share of the poses where problem 2's fusion contradicts problem 3
+SAME_POSE = 1e-3             # m and rad, standard deviation by which poses of both may differ
 MAX_LATE_SHARE = 0.1         # share of the ranges that keep less than half of their weight
 MAX_NOISE_FACTOR = 1.5       # on a sigma, or its inverse; beyond it the factor is reported
 MIN_FACTOR_SIGMAS = 4.0      # sigmas of the logarithm of a factor that is reported
@@ -279,12 +280,12 @@ def contradiction_doubts(poses: np.ndarray, covariances: np.ndarray,
                          by_slam: np.ndarray) -> tuple[Doubt, ...]:
     """Tuple of a Doubt if problem 2's fusion is too far from problem 3's poses `by_slam` (n, 3).
 
-    That is where many of its poses (n, 3) are beyond GATE of its own covariances (n, 3, 3).
+    That is where many of its poses (n, 3) are beyond GATE of its own covariances (n, 3, 3), with
+    SAME_POSE added, since a vehicle that stands may be known to rounding.
     """
-    is_uncertain = np.linalg.det(covariances) > 0
-    squared = se2.squared_distances(
-        poses[is_uncertain], by_slam[is_uncertain], covariances[is_uncertain])
-    share = np.mean(squared > GATE) if len(squared) else 0.0
+    added = SAME_POSE**2 * np.eye(3)
+    squared = se2.squared_distances(poses, by_slam, covariances + added)
+    share = np.mean(squared > GATE)
     if share < MIN_CONTRADICTING:
         return ()
     off = se2.between(by_slam, poses)[:, :2]
