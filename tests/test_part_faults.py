@@ -19,7 +19,7 @@ from slamlib import estimate, fuse
 from slamlib.core import se2
 from slamlib.core.vehicle import Vehicle
 from slamlib.robust.jumps import find_jumps, frozen_rows
-from slamlib.robust.part_faults import camera_bump, slipping_rows
+from slamlib.robust.part_faults import camera_bump, constant_delay, slipping_rows
 from slamlib.robust.solution_doubts import fusion_doubts, solution_doubts
 
 BUMP = np.array([0.05, -0.03, 0.06])
@@ -111,6 +111,14 @@ def test_a_camera_that_is_moved_and_put_back_is_no_two_jumps():
     z = dataset.aruco.marker_in_vehicle
     found = estimate(aruco(dataset, marker_in_vehicle=se2.compose(moved, z)).without("uwb"))
     assert aligned_ate(found, truth) < 0.01 and not len(found.jumps.start)
+
+
+@pytest.mark.parametrize("steps", [-25, 25])
+def test_a_delay_of_all_sightings_is_known_before_anything_is_solved(steps):
+    dataset, _ = short(4)
+    late = replace(dataset.aruco, pose=dataset.aruco.pose + steps)
+    inside = (late.pose >= 0) & (late.pose < len(dataset.ticks))
+    assert constant_delay(replace(dataset, aruco=late.select(inside))) == steps
 
 
 @pytest.mark.parametrize("poses, motion", [

@@ -79,11 +79,11 @@ MIN_SPARED_SLIP = 4.0        # ratio of the slips without and with jumps that ar
 MIN_JUMP_LEAD = 10.0         # log evidence by which a jump found at the solution is believed
 
 SMALL_SLIP = 2e-3            # sqrt(m), above which slow errors of sensors may be the cause
+LARGE_SLIP = 0.01            # sqrt(m), above which they mostly are
 AS_STATED = 1.25             # ratio of sigmas, within which errors are as large as stated
 BLOCKS = 12                  # parts of the drive, of which every second one is predicted
 BETTER = 1.15                # ratio of mean costs of predictions, by which a slip is believed
 FAR_BETTER = 1.5             # the same, of a large slip
-LARGE_SLIP = 0.01            # sqrt(m), which is implausible of wheels
 
 VISIT_GAP = 30               # typical intervals between sightings of a marker, that end a visit
 MIN_VISIT = 3                # number of accepted sightings of a visit that is compared
@@ -111,17 +111,26 @@ def memory_or_slip(problem: Problem, state: State) -> Fit:
     explains = (is_small or is_as_stated) and not has_memory(by_slip)
     if explains and is_small:
         return by_slip
-    by_memory = refine(replace(problem, memory_first=True), state)
+    memory_first = replace(problem, memory_first=True)
     if not explains:
-        return by_memory
-    if (by_memory.problem.accepted.share == 1).all():
+        return refine(memory_first, state)
+    try:
+        by_memory = refine(memory_first, state)
+        differs = (by_memory.problem.accepted.share < 1).any()
+        return by_memory if differs and not _predicts_better(by_slip, by_memory) else by_slip
+    except (DatasetError, np.linalg.LinAlgError):
         return by_slip
-    cost = _prediction_cost(by_memory)
-    cost_by_slip = _prediction_cost(by_slip)
-    log.info("prediction: cost %.3g by memory and a slip of %.3g mm after 1 m, %.3g by %.3g mm",
-             cost, 1e3 * by_memory.problem.noise.slip, cost_by_slip, 1e3 * slip)
+
+
+def _predicts_better(by_slip, by_memory):
+    """Whether a Fit by a slip predicts measurements so much better that the slip is believed."""
+    slip = by_slip.problem.noise.slip
+    cost = _prediction_cost(by_slip)
+    cost_by_memory = _prediction_cost(by_memory)
+    log.info("prediction: cost %.3g by a slip of %.3g mm after 1 m, %.3g by memory and %.3g mm",
+             cost, 1e3 * slip, cost_by_memory, 1e3 * by_memory.problem.noise.slip)
     needed = FAR_BETTER if slip >= LARGE_SLIP else BETTER
-    return by_slip if needed * cost_by_slip < cost else by_memory
+    return needed * cost < cost_by_memory
 
 
 def _prediction_cost(fit):

@@ -284,23 +284,28 @@ def _beside(s, drive, found, rank):
 def _without_bad_frames(s, drive, found, has_spike):
     """The _Jumps but those that soon cancel: in between, sightings are wrong, or late.
 
-    Jumps of which the last one is in a step with a spike of the counts stay; `has_spike` is a mask
-    (f-1,).
+    The nearest ones cancel first. Jumps of which the last one is in a step with a spike of the
+    counts stay; `has_spike` is a mask (f-1,).
     """
     kept = sorted(found, key=attrgetter("step"))
-    for most in (MAX_BAD_FRAMES, MAX_BAD_SHARE * len(drive.poses)):      # the nearest first
-        jumps = kept
-        kept = []
-        for jump in jumps:
-            kept.append(jump)
-            if has_spike[jump.step]:
-                continue
-            for k in reversed(range(len(kept) - 1)):
-                if jump.step - kept[k].step > most:
-                    break
-                if _cancel(s, drive, kept[k:]):
-                    del kept[k:]
-                    break
+    for most in (MAX_BAD_FRAMES, MAX_BAD_SHARE * len(drive.poses)):
+        kept = _without_cancelling(s, drive, kept, has_spike, most)
+    return kept
+
+
+def _without_cancelling(s, drive, jumps, has_spike, most):
+    """The _Jumps, in their order, but those that cancel within so many steps at `most`."""
+    kept = []
+    for jump in jumps:
+        kept.append(jump)
+        if has_spike[jump.step]:
+            continue
+        for k in reversed(range(len(kept) - 1)):
+            if jump.step - kept[k].step > most:
+                break
+            if _cancel(s, drive, kept[k:]):
+                del kept[k:]
+                break
     return kept
 
 
