@@ -9,6 +9,7 @@ from numeric import (
     aruco,
     counts,
     mean_nees,
+    only,
     seen_from,
     short,
     without_headings,
@@ -19,7 +20,12 @@ from slamlib import estimate, fuse
 from slamlib.core import se2
 from slamlib.core.vehicle import Vehicle
 from slamlib.robust.jumps import find_jumps, frozen_rows
-from slamlib.robust.part_faults import camera_bump, constant_delay, slipping_rows
+from slamlib.robust.part_faults import (
+    camera_bump,
+    constant_delay,
+    moving_increments,
+    slipping_rows,
+)
 from slamlib.robust.solution_doubts import fusion_doubts, solution_doubts
 
 BUMP = np.array([0.05, -0.03, 0.06])
@@ -111,6 +117,13 @@ def test_a_camera_that_is_moved_and_put_back_is_no_two_jumps():
     z = dataset.aruco.marker_in_vehicle
     found = estimate(aruco(dataset, marker_in_vehicle=se2.compose(moved, z)).without("uwb"))
     assert aligned_ate(found, truth) < 0.01 and not len(found.jumps.start)
+
+
+def test_increments_over_a_long_time_without_sightings_are_not_compared():
+    """Of markers at one place of four rounds: what odometry lost on a round is no other drive."""
+    dataset, _ = short(4, rounds=4)
+    poses = moving_increments(only(dataset, dataset.aruco.pose % 2000 < 200))[3]
+    assert np.unique(poses[:, 1] - poses[:, 0]).tolist() == [100] and len(poses) == 20
 
 
 @pytest.mark.parametrize("steps", [-25, 25])

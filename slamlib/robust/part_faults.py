@@ -40,6 +40,7 @@ log = logging.getLogger(__name__)
 
 MIN_COUNT = 10            # increments for a decision
 SPAN = 1.0                # m, over which increments are compared
+MAX_INTERVAL = 3.0        # ratio of the encoder steps between two frames to the usual number
 OVERLAP = 4               # number of increments at each place, at least
 MAX_FRAMES = 20           # over which increments are compared
 MIN_MOTION_SIGMAS = 5.0   # sigmas by markers of distance or turn, from which on the vehicle moves
@@ -83,6 +84,7 @@ def moving_increments(
         dataset: Dataset) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Increments of the moving vehicle between n pairs of frames about SPAN apart.
 
+    Those over a long time without sightings are left out: odometry says too little of them.
     Returns those by markers (n, 3) and by wheels (n, 3), the standard deviations of distance and
     turn by markers (n, 2), and the encoder poses of each pair of frames (n, 2), from 0.
     """
@@ -91,6 +93,10 @@ def moving_increments(
     sigma = distance_and_turn_sigmas(by_markers.covariance)
     size = np.maximum(distance_and_turn(by_markers.increment), distance_and_turn(wheels))
     moving = by_markers.usable & (size > MIN_MOTION_SIGMAS * sigma).any(axis=1)
+    if len(poses):
+        span = len(s.frame) - len(poses)                 # frames between those of a pair
+        usual = span * np.median(np.diff(s.frame))
+        moving &= poses[:, 1] - poses[:, 0] <= MAX_INTERVAL * usual
     return by_markers.increment[moving], wheels[moving], sigma[moving], poses[moving]
 
 
