@@ -46,7 +46,7 @@ from slamlib.robust.fit import (
     refine_without_memory,
     residuals,
 )
-from slamlib.robust.jumps import UNKNOWN_SIGMA, Jumps, find_jumps
+from slamlib.robust.jumps import UNKNOWN_SIGMA, Jumps, find_jumps, with_overlooked
 from slamlib.robust.linear import (
     NormalEquations,
     Problem,
@@ -77,6 +77,7 @@ MAX_PROPOSALS = 5            # number of sets that are solved
 MAX_COST = 1.5               # ratio of sigmas of the last position, by what is released untold
 MIN_SPARED_SLIP = 4.0        # ratio of the slips without and with jumps that are believed
 MIN_JUMP_LEAD = 10.0         # log evidence by which a jump found at the solution is believed
+MIN_REJECTED = 0.005         # share of the sightings, above which jumps may have been overlooked
 
 SMALL_SLIP = 2e-3            # sqrt(m), above which slow errors of sensors may be the cause
 LARGE_SLIP = 0.01            # sqrt(m), above which they mostly are
@@ -489,9 +490,10 @@ def most_consistent(
     can look like jumps or places, so the Fit without jumps, and that with places, is free to find
     one before it is compared with the other. A few jumps are also believed if the evidence leads
     and hardly any sighting contradicts them instead, or no marker tells them; a camera that was
-    moved, if the evidence leads. Where a solution stretches odometry beyond the slip that it
-    learned, most of all over a way without markers, one more jump is believed if the evidence leads
-    decisively.
+    moved, if the evidence leads. Where a solution rejects many sightings, one more jump is believed
+    that shows only with the slip that was learned, if it spares some, with no larger slip. Where a
+    solution stretches odometry beyond this slip, most of all over a way without markers, one more
+    jump is believed if the evidence leads decisively.
     """
     bump = camera_bump(dataset)
     fit = _with_jumps(dataset, start, decide, bump)
@@ -512,6 +514,12 @@ def most_consistent(
                 fit = decide(without)
                 if are_needed(with_places, fit):
                     return with_places, places
+    jumps = _overlooked(fit)
+    if jumps is not None:
+        other = _alternative(start, fit, jumps)
+        is_needed = spares_sightings(other, fit, "one more jump", MIN_SPARED)
+        if is_needed and other.problem.noise.slip <= fit.problem.noise.slip:
+            fit = decide(start(jumps))
     jumps = with_stretched(fit)
     if jumps is not None and _lead_of_jumps(_alternative(start, fit, jumps), fit) > MIN_JUMP_LEAD:
         return decide(start(jumps)), None
@@ -570,6 +578,19 @@ def _lead_of_jumps(fit, other):
         return -np.inf
     log.info("jumps: log evidence %+.1f", lead)
     return lead
+
+
+def _overlooked(fit):
+    """The Jumps of a Fit and one more that many of its rejected sightings may tell, or None.
+
+    Not where the slip is given, or the camera is late or was moved.
+    """
+    m = fit.problem.measurements
+    rejected = fit.problem.accepted.sightings.weight == 0
+    are_many = rejected.sum() > MIN_REJECTED * len(rejected)
+    if not are_many or not m.learned[0] or m.jumps.groups:
+        return None
+    return with_overlooked(m.dataset, m.jumps, fit.problem.noise.slip)
 
 
 def with_stretched(fit: Fit) -> Jumps | None:

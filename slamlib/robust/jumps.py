@@ -36,6 +36,10 @@ MIN_FROZEN = 20              # ratio of the lengths of runs of equal counts, fro
 SLIP = 0.03                  # sqrt(m), of a wheel after one metre
 FLOOR = 3e-3                 # m and rad, of an increment
 LEVER = 0.12                 # m, by which the camera may be elsewhere than stated
+# The same, by the slip that a solution has learned, and of a camera that is where it is stated
+SLIP_RATIO = 3.0             # of the slip to the one that was learned
+KNOWN_FLOOR = 1e-3           # m and rad
+KNOWN_LEVER = 0.02           # m
 # Decisions; gains are of twice the log likelihood
 SUSPECT = 7.8                # 95 % quantile of chi-squared with three degrees of freedom
 MIN_GAIN = 12.0              # by a jump
@@ -202,11 +206,9 @@ def find_jumps(dataset: Dataset) -> Jumps:
 
     Of the last Datasets it keeps what it found, which problems 2 and 3 share.
     """
-    s = sightings_by_frame(dataset.sightings)
+    s = _sightings_by_marker(dataset)
     if len(s.frame) < 2:
         return NO_JUMPS
-    order = np.lexsort((s.row, s.marker))
-    s = replace(s, row=s.row[order], marker=s.marker[order], z=s.z[order], C=s.C[order])
     vehicle = dataset.vehicle
     path = odometry.dead_reckoning(dataset.ticks, vehicle, model="arc")
     slipping = slipping_rows(dataset) | frozen_rows(dataset.ticks)
@@ -228,6 +230,32 @@ def find_jumps(dataset: Dataset) -> Jumps:
         jumps = jumps._with(start=start, end=end, increment=jump.increment,
                             by_odometry=jump.by_odometry, sigma=jump.sigma)
     return replace(jumps, chance=_chance(dataset.ticks, slipping)) if found else jumps
+
+
+def _sightings_by_marker(dataset):
+    """The Sightings of a Dataset, sorted by marker, then by frame."""
+    s = sightings_by_frame(dataset.sightings)
+    order = np.lexsort((s.row, s.marker))
+    return replace(s, row=s.row[order], marker=s.marker[order], z=s.z[order], C=s.C[order])
+
+
+def with_overlooked(dataset: Dataset, jumps: Jumps, slip: float) -> Jumps | None:
+    """The Jumps and the likeliest one more, None if there is none.
+
+    With the slip that a solution has learned, in sqrt(m), also smaller ones show than before.
+    """
+    s = _sightings_by_marker(dataset)
+    path = odometry.dead_reckoning(dataset.ticks, dataset.vehicle, model="arc")
+    poses = jumps.mended(s.frame, path[s.frame])
+    drive = replace(_Drive.without_jumps(poses, dataset.vehicle.wheelbase),
+                    slip=SLIP_RATIO * slip, floor=KNOWN_FLOOR, lever=KNOWN_LEVER)
+    found = _found(dataset.ticks, s, drive, np.zeros(len(path), bool))
+    more = [jump for jump in found if s.frame[jump.step] not in jumps.start]
+    if not more:
+        return None
+    jump = max(more, key=attrgetter("gain"))
+    return jumps.joined_by(s.frame[jump.step], s.frame[jump.step + 1], jump.increment,
+                           jump.by_odometry, len(path))
 
 
 def _chance(ticks, slipping):
@@ -388,6 +416,8 @@ class _Drive:
     variance: np.ndarray     # (f-1, 2) of a jump in each step, m^2 and rad^2
     wheelbase: float         # m
     slip: float = SLIP       # sqrt(m)
+    floor: float = FLOOR     # m and rad
+    lever: float = LEVER     # m
 
     @classmethod
     def without_jumps(cls, poses, wheelbase):
@@ -414,11 +444,11 @@ class _Drive:
         way = np.abs(self.way[end] - self.way[start])
         total = odometry.cumulative(self.variance)
         place, turn = np.abs(total[end] - total[start]).T        # variances, first by jumps alone
-        turn = turn + 2 * way * (self.slip / self.wheelbase)**2 + FLOOR**2
+        turn = turn + 2 * way * (self.slip / self.wheelbase)**2 + self.floor**2
         squared_distance = np.sum(move[:, :2]**2, axis=1)
         half_turn = se2.wrap(move[:, 2]) / 2
-        by_lever = 2 * LEVER * np.sin(half_turn)
-        place = place + turn * squared_distance / 3 + FLOOR**2 + by_lever**2
+        by_lever = 2 * self.lever * np.sin(half_turn)
+        place = place + turn * squared_distance / 3 + self.floor**2 + by_lever**2
         along = place + way * self.slip**2 / 2
         variance = np.stack([along, place, turn], axis=-1)
         return _Motions(move, variance[:, None] * np.eye(3))
