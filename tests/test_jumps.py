@@ -157,6 +157,29 @@ def test_a_fault_of_odometry_is_told_and_costs_little(name, clean):
     assert mean_nees(fuse(dataset), truth) < 6
 
 
+def pushed(dataset, truth, pose, motion):
+    """The drive whose vehicle somebody moves at a pose, by a motion (3,) in its axes."""
+    before = truth.poses[pose]
+    after = se2.between(before, truth.poses[pose:])
+    poses = truth.poses.copy()
+    poses[pose:] = se2.compose(se2.compose(before, motion), after)
+    seen_at = dataset.aruco.pose
+    back = se2.between(poses[seen_at], truth.poses[seen_at])
+    z = se2.compose(back, dataset.aruco.marker_in_vehicle)
+    return aruco(dataset, marker_in_vehicle=z), replace(truth, poses=poses)
+
+
+@pytest.mark.parametrize("pose", [805, 1505])
+def test_a_small_push_is_found_with_the_slip_that_was_learned(pose):
+    """By 3 cm to the side; ten later sightings were rejected instead, without a word."""
+    dataset, truth = short(3, rounds=2)
+    dataset, truth = pushed(dataset, truth, pose, np.array([0, 0.03, 0]))
+    found = estimate(dataset.without("uwb"))
+    assert [doubt.what for doubt in solution_doubts(found)] == ["encoder"]
+    assert found.jumps.start < pose <= found.jumps.end
+    assert mean_nees(found, truth) < 4 and aligned_ate(found, truth) < 0.0025
+
+
 @pytest.mark.slow
 def test_a_push_that_no_marker_saw_is_found_at_the_solution():
     """In 200 poses without markers, which a second round bridges; else slip seems tenfold."""
