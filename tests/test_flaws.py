@@ -241,7 +241,6 @@ def test_a_vehicle_that_stands_is_no_contradiction():
     assert not contradiction_doubts(poses, np.tile(1e-20 * np.eye(3), (10, 1, 1)), 0 * poses)
 
 
-
 def test_markers_of_one_accepted_sighting_or_at_the_place_of_another_are_unconfirmed(found):
     """The latter as of wrong labels, if they are seen less often. The summary names them."""
     marker, count = np.unique(found.sightings.marker, return_counts=True)

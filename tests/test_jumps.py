@@ -171,7 +171,7 @@ def pushed(dataset, truth, pose, motion):
 
 @pytest.mark.parametrize("pose", [805, 1505])
 def test_a_small_push_is_found_with_the_slip_that_was_learned(pose):
-    """By 3 cm to the side; ten later sightings were rejected instead, without a word."""
+    """By 3 cm to the side; ten or twelve sightings were rejected instead, without a word."""
     dataset, truth = short(3, rounds=2)
     dataset, truth = pushed(dataset, truth, pose, np.array([0, 0.03, 0]))
     found = estimate(dataset.without("uwb"))

@@ -46,7 +46,13 @@ from slamlib.robust.fit import (
     refine_without_memory,
     residuals,
 )
-from slamlib.robust.jumps import UNKNOWN_SIGMA, Jumps, find_jumps, with_overlooked
+from slamlib.robust.jumps import (
+    UNKNOWN_SIGMA,
+    Jumps,
+    cauchy_cost,
+    find_jumps,
+    with_overlooked,
+)
 from slamlib.robust.linear import (
     NormalEquations,
     Problem,
@@ -90,7 +96,7 @@ VISIT_GAP = 30               # typical intervals between sightings of a marker, 
 MIN_VISIT = 3                # number of accepted sightings of a visit that is compared
 MAX_REJECTED_SHARE = 0.5     # of the sightings of a visit
 MAX_SLIP_RATIO = 2.0         # of the slips with and without an explanation that is believed
-MIN_SPARED = 2               # number of sightings, by each place of an id that is believed
+MIN_SPARED = 2               # number of sightings, by each place of an id, or one more jump
 MAX_LOST = 0.1               # of these, number that may be rejected instead
 LOST_WEIGHT = 2              # number of these that outweigh one that is rejected instead
 PLACE_GATE = 60.0            # squared distance of x, y, heading in sigmas, beyond it another place
@@ -100,10 +106,11 @@ MIN_SIGMA = 0.02             # m or rad, of the path between two visits
 def memory_or_slip(problem: Problem, state: State) -> Fit:
     """The Fit of a Problem, near its solution, that explains slow errors by memory, or by slip.
 
-    Slow errors of sensors bend the path as slip does. A learned slip explains them only if errors
-    are independent then, and as large as stated unless it is small. Where this slip is not small
-    the errors may be slow all the same: it is believed only if it predicts better, and a large one
-    far better. Memory first finds the slip of wheels, too, but not always wrong statements on them.
+    Slow errors of sensors bend the path as slip does. A learned slip explains them if errors are
+    independent then; unless it is small, they must be as large as stated, too. Where it is not
+    small the errors may be slow all the same: the slip is believed only if it predicts better, and
+    a large one far better. Where wheels slip, memory first finds the slip, too; where they are
+    wrongly stated, it may find slow errors instead.
     """
     by_slip = refine_without_memory(replace(problem, memory_first=False), state)
     slip, *factors = by_slip.problem.noise
@@ -156,7 +163,7 @@ def _prediction_cost(fit):
         state = optimize(problem, fit.state, tolerance=ROUGH).state
         sightings, ranges = residuals(replace(problem, noise=Noise()), state)
         squared += [np.sum(sightings[predicted[0]]**2, axis=1), ranges[predicted[1]]**2]
-    costs = np.log1p(np.concatenate(squared) / GATE)
+    costs = cauchy_cost(np.concatenate(squared))
     return costs.sum() / max(len(costs), 1)
 
 

@@ -272,7 +272,7 @@ def _spikes(ticks):
     return counts > SPIKE * np.quantile(counts, 0.99)
 
 
-def _cost(squared):
+def cauchy_cost(squared: np.ndarray) -> np.ndarray:
     """Cauchy cost, twice a negative log likelihood, of squared Mahalanobis distances (m,)."""
     return GATE * np.log1p(squared / GATE)
 
@@ -370,7 +370,7 @@ def _cost_across(s, drive, first, last):
     both = sorted(before.keys() & after.keys())
     k = np.array([before[marker] for marker in both], int)
     seen_later = drive.seen_from(s.row[k], s, np.array([after[marker] for marker in both], int))
-    return _cost(_Motions(s.z[k], s.C[k]).squared_distances(seen_later)).sum()
+    return cauchy_cost(_Motions(s.z[k], s.C[k]).squared_distances(seen_later)).sum()
 
 
 def _covariance_scale(s, drive):
@@ -657,7 +657,7 @@ def _tried(s, drive, step, unknown):
 
     def cost(motion):
         expected = replace(move, mean=motion).then(later)
-        return _cost(seen.squared_distances(expected))
+        return cauchy_cost(seen.squared_distances(expected))
 
     motion = found.increment[0]
     gain = cost(np.zeros(3)) - cost(motion)
