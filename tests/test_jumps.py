@@ -34,7 +34,7 @@ from slamlib.robust.fused import fuse
 from slamlib.robust.initialization import odometry_state
 from slamlib.robust.linear import build_problem
 from slamlib.robust.measurements import measure
-from slamlib.robust.solution_doubts import _encoder_doubts, solution_doubts
+from slamlib.robust.solution_doubts import _encoder_doubts, fusion_doubts, solution_doubts
 from slamlib.studies.simulation import TABLE_2, manoeuvre, simulate
 
 drive = cache(simulate)
@@ -101,6 +101,19 @@ def test_a_jump_is_where_most_contradicting_pairs_span_it():
     dataset = seen(poses, np.tile(MARKERS, (2, 1)))
     in_room = dataset.aruco.pose // 10 % 2 == dataset.aruco.marker // 3
     found = jumps.find_jumps(only(dataset, in_room))
+    assert_allclose(found.mended(np.arange(40), np.zeros((40, 3))), poses, atol=1e-6)
+
+
+def test_a_jump_is_not_over_a_pair_that_agrees():
+    """Rooms A, B, A, then carried to B; of A the last two frames see one marker each, others."""
+    poses = np.zeros((40, 3))
+    poses[21:] = [0.4, 0.3, 0.5]
+    dataset = seen(poses, np.tile(MARKERS, (2, 1)))
+    pose, marker = dataset.aruco.pose, dataset.aruco.marker
+    in_b = (pose > 20) | (4 < pose) & (pose < 10)
+    is_seen = np.where(np.isin(pose, [19, 20]), marker == pose - 19, marker // 3 == in_b)
+    found = jumps.find_jumps(only(dataset, is_seen))
+    assert found.start.tolist() == [20] and (found.sigma < jumps.UNKNOWN_SIGMA).all()
     assert_allclose(found.mended(np.arange(40), np.zeros((40, 3))), poses, atol=1e-6)
 
 
@@ -178,6 +191,18 @@ def test_a_small_push_is_found_with_the_slip_that_was_learned(pose):
     assert [doubt.what for doubt in solution_doubts(found)] == ["encoder"]
     assert found.jumps.start < pose <= found.jumps.end
     assert mean_nees(found, truth) < 4 and aligned_ate(found, truth) < 0.0025
+
+
+@pytest.mark.parametrize("seed", [6, 7, 8])
+def test_the_fusion_finds_small_spins_of_a_wheel_all_at_once(seed):
+    """Of 5 cm each; by one of them alone, or none as before, it was 0.8 to 0.9 m off."""
+    dataset, truth = short(seed, rounds=2)
+    rows = np.concatenate([np.arange(first, first + 10) for first in (803, 1603, 2403)])
+    spun = counts(rows, lambda ticks: ticks + [64, 0])(dataset).without("uwb")
+    found = fuse(spun)
+    assert mean_nees(found, truth) < 6
+    assert ate(found.poses, truth.poses) < 1.5 * ate(fuse(dataset).poses, truth.poses)
+    assert {doubt.what for doubt in fusion_doubts(found, dataset.vehicle)} == {"encoder"}
 
 
 @pytest.mark.slow

@@ -521,12 +521,13 @@ def most_consistent(
                 fit = decide(without)
                 if are_needed(with_places, fit):
                     return with_places, places
-    jumps = _overlooked(fit)
-    if jumps is not None:
+    for jumps in _overlooked(fit):
+        count = len(jumps.start) - len(fit.problem.measurements.jumps.start)
         other = _alternative(start, fit, jumps)
-        is_needed = spares_sightings(other, fit, "one more jump", MIN_SPARED)
+        is_needed = spares_sightings(other, fit, "more jumps", MIN_SPARED * count)
         if is_needed and other.problem.noise.slip <= fit.problem.noise.slip:
             fit = decide(start(jumps))
+            break
     jumps = with_stretched(fit)
     if jumps is not None and _lead_of_jumps(_alternative(start, fit, jumps), fit) > MIN_JUMP_LEAD:
         return decide(start(jumps)), None
@@ -588,15 +589,15 @@ def _lead_of_jumps(fit, other):
 
 
 def _overlooked(fit):
-    """The Jumps of a Fit and one more that many of its rejected sightings may tell, or None.
+    """Jumps with those of a Fit and more that many of its rejected sightings may tell, a list.
 
-    Not where the slip is given, or the camera is late or was moved.
+    None where the slip is given, or the camera is late or was moved.
     """
     m = fit.problem.measurements
     rejected = fit.problem.accepted.sightings.weight == 0
     are_many = rejected.sum() > MIN_REJECTED * len(rejected)
     if not are_many or not m.learned[0] or m.jumps.groups:
-        return None
+        return []
     return with_overlooked(m.dataset, m.jumps, fit.problem.noise.slip)
 
 

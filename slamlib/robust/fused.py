@@ -31,7 +31,8 @@ by its innovations is taken (multiple models: Bar-Shalom, Li and Kirubarajan 200
 Stretches of the drive tell in advance which slips are tried, the memory, the factor on the standard
 deviations of the sightings, and whether the camera is elsewhere than stated. Beside slow errors, or
 larger ones than stated, no slip below the typical one is tried, as in the graph. The size of the
-markers is as stated.
+markers is as stated. With the slip that was learned, smaller jumps show than before; they are
+believed if the likeliest filter, near them, is likelier with them.
 """
 
 from dataclasses import dataclass, replace
@@ -47,7 +48,14 @@ from slamlib.core.records import NO_SIGHTINGS, Dataset
 from slamlib.core.sightings import GATE, sightings_by_frame
 from slamlib.robust.calibration import stated_calibration
 from slamlib.robust.error_memory import MAX_PAUSE
-from slamlib.robust.jumps import NO_JUMPS, Jumps, crawls, creep_covariance, find_jumps
+from slamlib.robust.jumps import (
+    NO_JUMPS,
+    Jumps,
+    crawls,
+    creep_covariance,
+    find_jumps,
+    with_overlooked,
+)
 from slamlib.robust.part_faults import camera_bump, constant_delay, with_wheels_mended
 
 SLIPS = TYPICAL_SLIP * SLIP_FACTOR ** np.arange(-1.0, 4.0)     # sqrt(m), of the first filters
@@ -155,7 +163,7 @@ def fuse(dataset: Dataset, slip: float | None = None) -> LearnedFusion:
     dataset = _with_camera_mended(dataset, slip or TYPICAL_SLIP)
     jumps = _believed_jumps(dataset, slip or TYPICAL_SLIP)
     models = _learned_models(dataset, jumps, slip)
-    states = _filter(dataset, jumps, models)
+    jumps, states = _with_more_jumps(dataset, jumps, models)
     last = states[-1]
     best = last.likeliest
     slip = models.slip[best]
@@ -189,6 +197,35 @@ def _believed_jumps(dataset, slip):
     if found.are_few:
         least = -least
     return found if gain >= least else NO_JUMPS
+
+
+def _with_more_jumps(dataset, jumps, models):
+    """The Jumps, with those that show by the slip that was learned if they are likelier.
+
+    Also the _State of filters with these _Models after each frame. None is sought where something
+    may have moved the camera, which may look like a jump.
+    """
+    states = _filter(dataset, jumps, models)
+    best = states[-1].likeliest
+    likeliest = _Models(*[field[[best]] for field in models])
+    if camera_bump(dataset) is not None:
+        return jumps, states
+    for more in with_overlooked(dataset, jumps, models.slip[best]):
+        near = _near(dataset, more.start)
+        gain = _log_densities(near, more, likeliest) - _log_densities(near, jumps, likeliest)
+        if gain >= MIN_JUMP_GAIN * (len(more.start) - len(jumps.start)):
+            return more, _filter(dataset, more, models)
+    return jumps, states
+
+
+def _near(dataset, poses):
+    """The Dataset with sightings in STRETCH_FRAMES around these encoder poses (m,) only."""
+    aruco = dataset.aruco
+    frame = np.unique(aruco.pose)
+    number = np.searchsorted(frame, aruco.pose)
+    off = number[:, None] - np.searchsorted(frame, poses)
+    is_near = (np.abs(off) <= STRETCH_FRAMES).any(axis=1)
+    return replace(dataset, aruco=aruco.select(is_near))
 
 
 def _with_delay_mended(dataset):

@@ -55,6 +55,7 @@ MIN_JUMP = 0.1               # m and rad, least standard deviation of the motion
 MAX_BAD_FRAMES = 10          # in a row, or
 MAX_BAD_SHARE = 0.15         # of all frames, if these are more
 CANCELLED = 0.3              # ratio of the size of all jumps together to that of one
+MIN_COST_RATIO = 1.5         # without jumps and with them, of markers seen before and after
 MAX_UNSUPPORTED = 2          # number of jumps; sensors that have more of them may be poor
 UNKNOWN_SIGMA = np.array([10.0, 10.0, np.pi])  # m, m, rad, if no marker tells
 SPIKE = 3.0                  # ratio to the counts of fast steps, above which a step is the jump
@@ -239,23 +240,28 @@ def _sightings_by_marker(dataset):
     return replace(s, row=s.row[order], marker=s.marker[order], z=s.z[order], C=s.C[order])
 
 
-def with_overlooked(dataset: Dataset, jumps: Jumps, slip: float) -> Jumps | None:
-    """The Jumps and the likeliest one more, None if there is none.
+def with_overlooked(dataset: Dataset, jumps: Jumps, slip: float) -> list[Jumps]:
+    """The Jumps and more of them: with all that were overlooked, and with the likeliest of these.
 
     With the slip that a solution has learned, in sqrt(m), also smaller ones show than before.
     """
     s = _sightings_by_marker(dataset)
+    if len(s.frame) < 2:
+        return []
     path = odometry.dead_reckoning(dataset.ticks, dataset.vehicle, model="arc")
     poses = jumps.mended(s.frame, path[s.frame])
     drive = replace(_Drive.without_jumps(poses, dataset.vehicle.wheelbase),
                     slip=SLIP_RATIO * slip, floor=KNOWN_FLOOR, lever=KNOWN_LEVER)
     found = _found(dataset.ticks, s, drive, np.zeros(len(path), bool))
     more = [jump for jump in found if s.frame[jump.step] not in jumps.start]
-    if not more:
-        return None
-    jump = max(more, key=attrgetter("gain"))
-    return jumps.joined_by(s.frame[jump.step], s.frame[jump.step + 1], jump.increment,
-                           jump.by_odometry, len(path))
+    more.sort(key=attrgetter("gain"))
+
+    def joined(jumps, jump):
+        return jumps.joined_by(s.frame[jump.step], s.frame[jump.step + 1], jump.increment,
+                               jump.by_odometry, len(path))
+
+    alternatives = [reduce(joined, some, jumps) for some in (more, more[-1:])]
+    return alternatives[:len(more)]                      # one is all
 
 
 def _chance(ticks, slipping):
@@ -340,9 +346,9 @@ def _without_cancelling(s, drive, jumps, has_spike, most):
 def _cancel(s, drive, run):
     """Whether _Jumps move what follows by far less than the first and the last of them do.
 
-    Two jumps also cancel as motions of the camera, which is then where it was before (within
-    CANCELLED m and rad), unless markers seen before and after them say that the vehicle is
-    elsewhere.
+    They also cancel if these two do as motions of the camera, which is then where it was before
+    (within CANCELLED m and rad), unless markers seen before and after them agree far better with
+    these jumps.
     """
     first = run[0].step
     last = run[-1].step + 1
@@ -353,9 +359,11 @@ def _cancel(s, drive, run):
     most = CANCELLED * min(map(size_of, motions))
     if size_of(off) < most:
         return True
-    if len(run) > 2 or size_of(se2.compose(*motions)) >= min(most, CANCELLED):
+    if size_of(se2.compose(*motions)) >= min(most, CANCELLED):
         return False
-    return _cost_across(s, drive, first, last) <= _cost_across(s, moved, first, last)
+    in_place = replace(moved, poses=drive.poses)
+    cost = _cost_across(s, in_place, first, last)
+    return cost <= MIN_COST_RATIO * _cost_across(s, moved, first, last)
 
 
 def _cost_across(s, drive, first, last):
@@ -521,10 +529,11 @@ def _rank(pairs):
     """Rank (f-1,) of each step: which of them is asked first for a jump.
 
     Those with sightings at both frames come first, then those under most pairs that contradict
-    odometry. A pair over a long way does not tell where on it a jump was.
+    odometry, less those that agree with it. A pair over a long way does not tell where on it a jump
+    was.
     """
     all_close = pairs.over(pairs.span == 1)
-    return np.where(all_close, -np.inf, -pairs.over(pairs.wrong))
+    return np.where(all_close, -np.inf, pairs.over(~pairs.wrong) - pairs.over(pairs.wrong))
 
 
 def _breaks(s, poses, pairs):
