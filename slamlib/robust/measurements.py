@@ -125,11 +125,15 @@ class Measurements:
         return np.array([ORIGIN_SIGMA, ORIGIN_SIGMA, self.dataset.vehicle.sigma_heading])
 
     @property
+    def measured(self) -> np.ndarray:
+        """(3,) bool, noise parameters of which there are measurements."""
+        return np.array([1, len(self.marker_row), len(self.ranges.row)]) > 0
+
+    @property
     def learned(self) -> np.ndarray:
-        """(3,) bool, noise parameters that are learned: unknown ones with measurements."""
+        """(3,) bool, noise parameters that are learned: those of them that are unknown."""
         unknown = [getattr(self.dataset.vehicle, key) is None for key in NOISE_KEYS]
-        count = [1, len(self.marker_row), len(self.ranges.row)]
-        return np.logical_and(unknown, count)
+        return self.measured & unknown
 
     @cached_property
     def odometry_noise(self) -> tuple[np.ndarray, np.ndarray]:

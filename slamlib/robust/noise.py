@@ -55,6 +55,7 @@ class NoisePosterior:
     noise: Noise                 # the mode
     covariance: np.ndarray       # (3, 3) of its logarithms, 0 for parameters that are not learned
     log_density: float           # log posterior at the mode, up to a constant
+    lead: float = 0.0            # of it over that of the noise from which it was sought
 
     @property
     def mean(self) -> Noise:
@@ -62,31 +63,35 @@ class NoisePosterior:
         return _noise_of(np.log(self.noise) + np.diag(self.covariance) / 2)
 
 
-def learn_noise(equations: NormalEquations) -> NoisePosterior:
-    """The NoisePosterior by NormalEquations near the solution, from the noise of their problem."""
+def learn_noise(equations: NormalEquations, is_free: np.ndarray | None = None) -> NoisePosterior:
+    """The NoisePosterior by NormalEquations near the solution, from the noise of their problem.
+
+    Of the parameters that `is_free` (3,), None for those that are learned.
+    """
     noise = equations.problem.noise
     measurements = equations.problem.measurements
-    free = np.flatnonzero(measurements.learned)
-    log_posterior = partial(_log_posterior, equations)
+    if is_free is None:
+        is_free = measurements.learned
+    free = np.flatnonzero(is_free)
+    log_posterior = partial(_log_posterior, equations, is_free)
     start = np.log(noise)
-    value = log_posterior(start)
-    if value < SINGULAR / 2:                             # nothing can be learned
+    at_start = log_posterior(start)
+    if at_start < SINGULAR / 2:                          # nothing can be learned
         return NoisePosterior(noise, np.zeros((3, 3)), SINGULAR)
     sightings, ranges = equations.counts()
     count = np.maximum([3 * len(measurements.frame), sightings, ranges], 1)
     sigma = 1 / np.sqrt(2 * count)                       # of the logarithm of a scatter
-    mode, value, covariance = _mode(log_posterior, start, value, free, sigma[free])
+    mode, value, covariance = _mode(log_posterior, start, at_start, free, sigma[free])
     learned = _noise_of(mode)
     log.info("noise: slip %.3g mm after 1 m, factors %.3g of sightings and %.3g of ranges, "
              "log posterior %.1f", 1e3 * learned.slip, learned.sightings, learned.ranges, value)
-    return NoisePosterior(learned, covariance, value)
+    return NoisePosterior(learned, covariance, value, lead=value - at_start)
 
 
-def _log_posterior(equations, logarithms):
+def _log_posterior(equations, is_free, logarithms):
     """Log posterior density, up to a constant, of these logarithms (3,) of the noise."""
     evidence = laplace_approximation(equations, _noise_of(logarithms))[1]
     off = (logarithms - np.log(MEDIAN)) / PRIOR_SIGMA
-    is_free = equations.problem.measurements.learned
     return max(evidence, SINGULAR) - np.sum(off[is_free]**2) / 2
 
 

@@ -8,10 +8,13 @@ import numpy as np
 from slamlib.core import se2
 from slamlib.core.sightings import GATE
 from slamlib.core.vehicle import Vehicle
+from slamlib.robust.choices import DECISIVE_RELEASE, STATED
 from slamlib.robust.file_doubts import Doubt
 from slamlib.robust.fused import LearnedFusion
 from slamlib.robust.jumps import UNKNOWN_SIGMA
-from slamlib.robust.noise import BOUNDS
+from slamlib.robust.linear import NormalEquations
+from slamlib.robust.measurements import NOISE_KEYS
+from slamlib.robust.noise import BOUNDS, learn_noise
 from slamlib.robust.result import SlamResult
 
 MAX_GAP = 30                 # poses, between contradictions that are told as one
@@ -60,8 +63,8 @@ GROUPS = {
 def solution_doubts(result: SlamResult) -> tuple[Doubt, ...]:
     """Tuple of Doubt where a SlamResult contradicts the files of its drive."""
     doubts = []
-    for check in (_encoder_doubts, _calibration_doubts, _noise_doubts, _place_doubts,
-                  _rejection_doubts, _path_doubts, _agreement_doubts):
+    for check in (_encoder_doubts, _calibration_doubts, _noise_doubts, _stated_noise_doubts,
+                  _place_doubts, _rejection_doubts, _path_doubts, _agreement_doubts):
         doubts += check(result)
     for antenna, reason in result.doubts.items():
         doubts.append(Doubt("antenna", f"Antenna {antenna} is in doubt: {reason}.",
@@ -216,6 +219,26 @@ def _factor_doubt(result, kind):
             sentence += f" {late:.0%} of them are far too long, as without line of sight."
     yield Doubt(f"{kind.doubt}-noise", sentence,
                 "Look at how the sensor's covariances were obtained.")
+
+
+def _stated_noise_doubts(result):
+    """A Doubt if the drive contradicts the stated noise, with which it is solved."""
+    problem = result.fit.problem
+    m = problem.measurements
+    stated = m.measured & ~m.learned
+    if not stated.any():
+        return
+    found = learn_noise(NormalEquations(problem, result.fit.state), m.measured)
+    if found.lead < DECISIVE_RELEASE + STATED:
+        return
+    sigma = np.sqrt(np.diag(found.covariance))
+    off = np.abs(np.log(found.noise) - np.log(result.noise)) > MIN_FACTOR_SIGMAS * sigma
+    told = [f"{NOISE_KEYS[k]} = {found.noise[k]:.2g} ± {found.noise[k] * sigma[k]:.1g} (stated: "
+            f"{result.noise[k]:.2g})" for k in np.flatnonzero(stated & off)]
+    if told:
+        yield Doubt("stated-noise", (
+            f"By the drive {' and '.join(told)}; {_problem(result)} uses what is stated, and its "
+            "covariances follow from it."), "Leave it out of vehicle.toml: then it is learned.")
 
 
 def _are_sigmas(result, factor):
