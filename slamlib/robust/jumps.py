@@ -347,8 +347,8 @@ def _cancel(s, drive, run):
     """Whether _Jumps move what follows by far less than the first and the last of them do.
 
     They also cancel if these two do as motions of the camera, which is then where it was before
-    (within CANCELLED m and rad), unless markers seen before and after them agree far better with
-    these jumps.
+    (within CANCELLED m and rad), and all others are as small, unless markers seen before and after
+    them agree far better with these jumps.
     """
     first = run[0].step
     last = run[-1].step + 1
@@ -359,7 +359,8 @@ def _cancel(s, drive, run):
     most = CANCELLED * min(map(size_of, motions))
     if size_of(off) < most:
         return True
-    if size_of(se2.compose(*motions)) >= min(most, CANCELLED):
+    largest_between = max((size_of(jump.motion) for jump in run[1:-1]), default=0.0)
+    if max(largest_between, size_of(se2.compose(*motions))) >= min(most, CANCELLED):
         return False
     in_place = replace(moved, poses=drive.poses)
     cost = _cost_across(s, in_place, first, last)
@@ -655,6 +656,14 @@ def _tried(s, drive, step, unknown):
     seen = drive.seen_from(step, s, before)
     exact = replace(move, covariance=np.zeros((1, 3, 3)))
     later = exact.then(drive.seen_from(step + 1, s, after))
+
+    def cost(motion):
+        expected = replace(move, mean=motion).then(later)
+        return cauchy_cost(seen.squared_distances(expected))
+
+    without = cost(np.zeros(3))
+    if unknown is None and without.sum() <= MIN_GAIN:    # no motion gains more
+        return untold
     mean = np.concatenate([seen.mean, later.mean])
     covariance = np.concatenate([seen.covariance, later.covariance])
     first = np.arange(len(before))
@@ -664,12 +673,8 @@ def _tried(s, drive, step, unknown):
     if not found.usable[0] or variance[0] > MAX_VARIANCE:
         return untold
 
-    def cost(motion):
-        expected = replace(move, mean=motion).then(later)
-        return cauchy_cost(seen.squared_distances(expected))
-
     motion = found.increment[0]
-    gain = cost(np.zeros(3)) - cost(motion)
+    gain = without - cost(motion)
     others = gain.sum() - gain.max()
     return replace(untold, motion=motion, variance=variance, sigma=_sigma_of(motion),
                    gain=gain.sum(), found=untold.found or others > MIN_GAIN)
