@@ -86,11 +86,12 @@ MIN_JUMP_LEAD = 10.0         # log evidence by which a jump found at the solutio
 MIN_REJECTED = 0.005         # share of the sightings, above which jumps may have been overlooked
 
 SMALL_SLIP = 2e-3            # sqrt(m), above which slow errors of sensors may be the cause
-LARGE_SLIP = 0.01            # sqrt(m), above which they mostly are
+LARGE_SLIP = 0.01            # sqrt(m), above which errors of sensors mostly are
 AS_STATED = 1.25             # ratio of sigmas, within which errors are as large as stated
 BLOCKS = 12                  # parts of the drive, of which every second one is predicted
 BETTER = 1.15                # ratio of mean costs of predictions, by which a slip is believed
 FAR_BETTER = 1.5             # the same, of a large slip
+MIN_OVER_ROUNDING = 4.0      # ratio of variances of a slip and of the rounding of counts
 
 VISIT_GAP = 30               # typical intervals between sightings of a marker, that end a visit
 MIN_VISIT = 3                # number of accepted sightings of a visit that is compared
@@ -111,6 +112,10 @@ def memory_or_slip(problem: Problem, state: State) -> Fit:
     small the errors may be slow all the same: the slip is believed only if it predicts better, and
     a large one far better. Where wheels slip, memory first finds the slip, too; where they are
     wrongly stated, it may find slow errors instead.
+
+    Errors that all markers of an image share, as of its time, look like a large slip, too. That
+    must predict better than larger errors of the sightings do, with a small slip. Not where the
+    counts are so coarse that their rounding looks like this slip.
     """
     by_slip = refine_without_memory(replace(problem, memory_first=False), state)
     slip, *factors = by_slip.problem.noise
@@ -120,25 +125,45 @@ def memory_or_slip(problem: Problem, state: State) -> Fit:
     if explains and is_small:
         return by_slip
     memory_first = replace(problem, memory_first=True)
+    found = by_slip if explains else refine(memory_first, state)
+    is_large = problem.measurements.learned[0] and found.problem.noise.slip >= LARGE_SLIP
+    if is_large and not _is_rounding(found):
+        by_images = _refined(replace(problem, max_slip=SMALL_SLIP), state)
+        if by_images is not None and not _predicts_better(found, by_images, 1.0):
+            return by_images
     if not explains:
-        return refine(memory_first, state)
-    try:
-        by_memory = refine(memory_first, state)
-        differs = (by_memory.problem.accepted.share < 1).any()
-        return by_memory if differs and not _predicts_better(by_slip, by_memory) else by_slip
-    except (DatasetError, np.linalg.LinAlgError):
+        return found
+    by_memory = _refined(memory_first, state)
+    if by_memory is None or (by_memory.problem.accepted.share == 1).all():
         return by_slip
+    needed = FAR_BETTER if is_large else BETTER
+    return by_slip if _predicts_better(by_slip, by_memory, needed) else by_memory
 
 
-def _predicts_better(by_slip, by_memory):
-    """Whether a Fit by a slip predicts measurements so much better that the slip is believed."""
-    slip = by_slip.problem.noise.slip
+def _refined(problem, state):
+    """The Fit of a Problem, or None if it has no solution."""
+    try:
+        return refine(problem, state)
+    except (DatasetError, np.linalg.LinAlgError):
+        return None
+
+
+def _is_rounding(fit):
+    """Whether the slip of a Fit between two frames may be the rounding of the counts there."""
+    m = fit.problem.measurements
+    along = m.odometry_noise[1][:, 0, 0]
+    variance = fit.problem.noise.slip**2 * np.median(along)
+    rounding = m.dataset.vehicle.metres_per_count.max()**2 / 6
+    return variance < MIN_OVER_ROUNDING * rounding
+
+
+def _predicts_better(by_slip, other, needed):
+    """Whether a Fit by a slip predicts measurements better than another one, by a ratio."""
     cost = _prediction_cost(by_slip)
-    cost_by_memory = _prediction_cost(by_memory)
-    log.info("prediction: cost %.3g by a slip of %.3g mm after 1 m, %.3g by memory and %.3g mm",
-             cost, 1e3 * slip, cost_by_memory, 1e3 * by_memory.problem.noise.slip)
-    needed = FAR_BETTER if slip >= LARGE_SLIP else BETTER
-    return needed * cost < cost_by_memory
+    cost_of_other = _prediction_cost(other)
+    log.info("prediction: cost %.3g by a slip of %.3g mm after 1 m, %.3g by %.3g mm", cost,
+             1e3 * by_slip.problem.noise.slip, cost_of_other, 1e3 * other.problem.noise.slip)
+    return needed * cost < cost_of_other
 
 
 def _prediction_cost(fit):

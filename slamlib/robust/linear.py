@@ -80,6 +80,7 @@ class Problem:
     prior: Prior             # of the calibration
     reference: np.ndarray    # (p,) a calibration, by whose delays rows are chosen
     memory_first: bool = False   # whether memory is sought before a slip is learned
+    max_slip: float = np.inf     # sqrt(m), of a slip that is learned
 
     @property
     def active(self) -> np.ndarray:

@@ -81,7 +81,9 @@ def learn_noise(equations: NormalEquations, is_free: np.ndarray | None = None) -
     sightings, ranges = equations.counts()
     count = np.maximum([3 * len(measurements.frame), sightings, ranges], 1)
     sigma = 1 / np.sqrt(2 * count)                       # of the logarithm of a scatter
-    mode, value, covariance = _mode(log_posterior, start, at_start, free, sigma[free])
+    bounds = BOUNDS.copy()
+    bounds[1, 0] = min(bounds[1, 0], np.log(equations.problem.max_slip))
+    mode, value, covariance = _mode(log_posterior, start, at_start, free, sigma[free], bounds)
     learned = _noise_of(mode)
     log.info("noise: slip %.3g mm after 1 m, factors %.3g of sightings and %.3g of ranges, "
              "log posterior %.1f", 1e3 * learned.slip, learned.sightings, learned.ranges, value)
@@ -100,19 +102,19 @@ def _noise_of(logarithms):
     return Noise(*np.exp(logarithms))
 
 
-def _mode(log_density, x, value, free, steps):
+def _mode(log_density, x, value, free, steps, bounds):
     """Argument, value and covariance (3, 3) of the maximum of a log density, by Newton's method.
 
-    From `x` (3,) with its `value`. Derivatives by the components `free` (p,) are differences over
-    `steps` (p,), later over standard deviations.
+    From `x` (3,) with its `value`, within `bounds` (2, 3). Derivatives by the components `free`
+    (p,) are differences over `steps` (p,), later over standard deviations.
     """
     steps = np.clip(steps, MIN_DIFFERENCE, MAX_DIFFERENCE)
 
     def moved(step):
-        """x with `step` (p,) added to the free components, within BOUNDS."""
+        """x with `step` (p,) added to the free components, within the bounds."""
         stepped = x.copy()
         stepped[free] += step
-        return np.clip(stepped, BOUNDS[0], BOUNDS[1])
+        return np.clip(stepped, bounds[0], bounds[1])
 
     def density_at(step):
         return log_density(moved(step))

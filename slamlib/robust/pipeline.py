@@ -140,7 +140,8 @@ def fit_from_odometry(measurements: Measurements, model: str = "arc",
     if like is None:                                                                  # 6
         return memory_or_slip(problem, state)
     decided = like.problem
-    problem = replace(problem, prior=decided.prior, memory_first=decided.memory_first)
+    problem = replace(problem, prior=decided.prior, memory_first=decided.memory_first,
+                      max_slip=decided.max_slip)
     state = narrow_kernels(problem, replace(state, c=like.state.c), CAUCHY_SCALES[-1:])
     fit = refine(problem, state)
     return replace(fit, explanations=like.explanations, lead=like.lead)
@@ -153,7 +154,8 @@ def fit_from_previous(measurements: Measurements, previous: SlamResult,
     problem = build_problem(m, model or previous.model, Noise(previous.slip), previous.wheel)
     decided = previous.fit.problem
     prior = m.calibration.prior(decided.prior.groups, decided.prior.width)
-    problem = replace(problem, prior=prior, memory_first=decided.memory_first)
+    problem = replace(problem, prior=prior, memory_first=decided.memory_first,
+                      max_slip=decided.max_slip)
     c = m.calibration.taken_from(previous.calibration, previous.c)
     state = state_from_poses(m, previous.poses[m.frame], previous.covariances[m.frame], c)
     state = narrow_kernels(problem, state, CAUCHY_SCALES[-1:])
