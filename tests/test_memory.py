@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from conftest import ROOT
-from numeric import aligned_ate, aruco, mean_nees, short, sightings, uwb
+from numeric import aligned_ate, aruco, mean_nees, short, sightings, uwb, vehicle
 from numpy.testing import assert_allclose, assert_array_equal
 
 from slamlib import estimate
@@ -192,6 +192,29 @@ def test_antennas_with_echoes_that_stay_are_as_far_off_as_their_covariances_say(
 
 
 # An id is one place until it is not.
+
+
+@pytest.mark.parametrize("latest", [4, 6])
+@pytest.mark.parametrize("seed", [2, 3])
+def test_images_with_wrong_pose_ids_are_no_slip_and_do_not_hide_a_wrong_size(latest, seed):
+    """Each is up to `latest` poses late, by chance: a slip of 50 to 90 mm, 65 mm off before."""
+    dataset, truth = short(seed, rounds=2)
+    pose, image = np.unique(dataset.aruco.pose, return_inverse=True)
+    late = pose + np.random.default_rng(seed).integers(0, latest + 1, len(pose))
+    readings = replace(dataset.aruco, pose=late[image])
+    dataset = replace(dataset, aruco=readings.select(readings.pose < len(dataset.ticks)), uwb=None)
+    found = estimate(vehicle(marker_size=0.98)(dataset))
+    assert aligned_ate(found, truth) < 0.005 and mean_nees(found, truth) < 6
+    assert found.released == {"marker-size", "time-offset"}
+
+
+def test_a_pair_of_less_than_half_an_interval_leaves_no_negative_share():
+    """Images come in pairs, whose errors are opposite; those of every second image are alike."""
+    pose = np.add.outer(10 * np.arange(60), [0, 1]).ravel()
+    error = np.tile([1.0, -1.0], 60)[:, None]
+    share = error_memory(np.zeros(120, int), pose, error, np.zeros((120, 1, 1)),
+                         np.ones(120, bool)).share
+    assert (share > 0).all()
 
 
 def test_visits_end_with_a_long_break():

@@ -101,7 +101,7 @@ def error_memory(landmark: np.ndarray, pose: np.ndarray, r: np.ndarray, changes:
         remembered = (rho >= MIN_RHO) & (count >= MIN_PAIRS)
         remembered[0] = True                         # pairs of less than half an interval
         rho[~np.logical_and.accumulate(remembered)] = 0.0
-        rho_of_pair = rho[pairs.lag]
+        rho_of_pair = np.maximum(rho, 0)[pairs.lag]
         with_later = np.bincount(pairs.first, rho_of_pair, len(rows))
         with_earlier = np.bincount(pairs.second, rho_of_pair, len(rows))
         share[rows] = 1 / (1 + with_later + with_earlier)
