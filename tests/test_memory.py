@@ -209,12 +209,12 @@ def test_images_with_wrong_pose_ids_are_no_slip_and_do_not_hide_a_wrong_size(lat
 
 
 def test_a_pair_of_less_than_half_an_interval_leaves_no_negative_share():
-    """Images come in pairs, whose errors are opposite; those of every second image are alike."""
-    pose = np.add.outer(10 * np.arange(60), [0, 1]).ravel()
-    error = np.tile([1.0, -1.0], 60)[:, None]
-    share = error_memory(np.zeros(120, int), pose, error, np.zeros((120, 1, 1)),
-                         np.ones(120, bool)).share
-    assert (share > 0).all()
+    """The first two of four sightings of each marker have opposite errors, the others are alike."""
+    marker = np.repeat(np.arange(400), 4)
+    pose = np.tile([0, 1, 10, 19], 400)
+    error = np.tile([3.0, -2.0, 1.0, 1.0], 400)[:, None]
+    found = error_memory(marker, pose, error, np.zeros((1600, 1, 1)), np.ones(1600, bool))
+    assert found.correlation > 0.1 and (found.share > 0).all() and (found.share <= 1).all()
 
 
 def test_visits_end_with_a_long_break():
