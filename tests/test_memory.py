@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from slamlib import estimate
 from slamlib.core.evaluation import ate, nees_band
 from slamlib.core.vehicle import TABLE_2
-from slamlib.robust.choices import _squared_distance, visits
+from slamlib.robust.choices import SMALL_SLIP, _squared_distance, visits
 from slamlib.robust.error_memory import error_memory
 from slamlib.robust.fit import error_memories, narrow_kernels, refine
 from slamlib.robust.initialization import initial_state
@@ -135,7 +135,8 @@ def test_a_camera_that_shakes_is_no_slip():
     assert mean_nees(found, truth) < 6           # 12 by slip
     assert "marker-memory" in [doubt.what for doubt in solution_doubts(found)]
     both = estimate(dataset, previous=found)
-    assert both.fit.problem.memory_first and both.slip < 2e-3
+    assert both.fit.problem.max_slip == found.fit.problem.max_slip == SMALL_SLIP
+    assert both.slip < 2e-3
 
 
 @pytest.mark.parametrize("options, correlation, slip", [
