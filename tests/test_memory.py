@@ -209,6 +209,13 @@ def test_images_with_wrong_pose_ids_are_no_slip_and_do_not_hide_a_wrong_size(lat
     assert found.released == {"marker-size", "time-offset"}
 
 
+def test_a_slip_comes_within_its_bound_from_above():
+    measurements = measure(short(2)[0].without("uwb"))                 # by a slip of 1 mm
+    problem = replace(build_problem(measurements, "arc", Noise(0.03)), max_slip=5e-4)
+    state = narrow_kernels(problem, initial_state(measurements, "arc"))
+    assert refine(problem, state).problem.noise.slip == pytest.approx(5e-4, rel=0.01)
+
+
 def test_a_pair_of_less_than_half_an_interval_leaves_no_negative_share():
     """The first two of four sightings of each marker have opposite errors, the others are alike."""
     marker = np.repeat(np.arange(400), 4)

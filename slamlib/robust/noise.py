@@ -74,15 +74,15 @@ def learn_noise(equations: NormalEquations, is_free: np.ndarray | None = None) -
         is_free = measurements.learned
     free = np.flatnonzero(is_free)
     log_posterior = partial(_log_posterior, equations, is_free)
-    start = np.log(noise)
+    bounds = BOUNDS.copy()
+    bounds[1, 0] = min(bounds[1, 0], np.log(equations.problem.max_slip))
+    start = np.clip(np.log(noise), bounds[0], bounds[1])
     at_start = log_posterior(start)
     if at_start < SINGULAR / 2:                          # nothing can be learned
         return NoisePosterior(noise, np.zeros((3, 3)), SINGULAR)
     sightings, ranges = equations.counts()
     count = np.maximum([3 * len(measurements.frame), sightings, ranges], 1)
     sigma = 1 / np.sqrt(2 * count)                       # of the logarithm of a scatter
-    bounds = BOUNDS.copy()
-    bounds[1, 0] = min(bounds[1, 0], np.log(equations.problem.max_slip))
     mode, value, covariance = _mode(log_posterior, start, at_start, free, sigma[free], bounds)
     learned = _noise_of(mode)
     log.info("noise: slip %.3g mm after 1 m, factors %.3g of sightings and %.3g of ranges, "
