@@ -211,7 +211,7 @@ def test_images_with_wrong_pose_ids_are_no_slip_and_do_not_hide_a_wrong_size(lat
 
 def test_a_slip_comes_within_its_bound_from_above():
     measurements = measure(short(2)[0].without("uwb"))                 # by a slip of 1 mm
-    problem = replace(build_problem(measurements, "arc", Noise(0.03)), max_slip=5e-4)
+    problem = replace(build_problem(measurements, "arc", Noise(1.2e-3)), max_slip=5e-4)
     state = narrow_kernels(problem, initial_state(measurements, "arc"))
     assert refine(problem, state).problem.noise.slip == pytest.approx(5e-4, rel=0.01)
 
