@@ -105,7 +105,7 @@ def test_a_jump_is_where_most_contradicting_pairs_span_it():
 
 
 def test_a_jump_is_not_over_a_pair_that_agrees():
-    """Rooms A, B, A, then carried to B; of A the last two frames see one marker each, others."""
+    """Rooms A, B, A, then carried to B. The last two frames in A see two different markers."""
     poses = np.zeros((40, 3))
     poses[21:] = [0.4, 0.3, 0.5]
     dataset = seen(poses, np.tile(MARKERS, (2, 1)))

@@ -97,7 +97,7 @@ VISIT_GAP = 30               # typical intervals between sightings of a marker, 
 MIN_VISIT = 3                # number of accepted sightings of a visit that is compared
 MAX_REJECTED_SHARE = 0.5     # of the sightings of a visit
 MAX_SLIP_RATIO = 2.0         # of the slips with and without an explanation that is believed
-MIN_SPARED = 2               # number of sightings, by each place of an id, or one more jump
+MIN_SPARED = 2               # number of sightings, by each place of an id, or each more jump
 MAX_LOST = 0.1               # of these, number that may be rejected instead
 LOST_WEIGHT = 2              # number of these that outweigh one that is rejected instead
 PLACE_GATE = 60.0            # squared distance of x, y, heading in sigmas, beyond it another place
@@ -113,9 +113,9 @@ def memory_or_slip(problem: Problem, state: State) -> Fit:
     a large one far better. Where wheels slip, memory first finds the slip, too; where they are
     wrongly stated, it may find slow errors instead.
 
-    Errors that all markers of an image share, as of its time, look like a large slip, too. That
-    must predict better than larger errors of the sightings do, with a small slip. Not where the
-    counts are so coarse that their rounding looks like this slip.
+    Errors that all markers of an image share, as of its time, look like a large slip, too. So a
+    large slip must predict better than a small one with larger errors of the sightings. These are
+    not compared where the rounding of coarse counts looks like this slip.
     """
     by_slip = refine_without_memory(replace(problem, memory_first=False), state)
     slip, *factors = by_slip.problem.noise
@@ -153,7 +153,7 @@ def _is_rounding(fit):
     m = fit.problem.measurements
     along = m.odometry_noise[1][:, 0, 0]
     variance = fit.problem.noise.slip**2 * np.median(along)
-    rounding = m.dataset.vehicle.metres_per_count.max()**2 / 6
+    rounding = m.dataset.vehicle.metres_per_count.max()**2 / 6       # of a difference of two
     return variance < MIN_OVER_ROUNDING * rounding
 
 
@@ -522,10 +522,10 @@ def most_consistent(
     can look like jumps or places, so the Fit without jumps, and that with places, is free to find
     one before it is compared with the other. A few jumps are also believed if the evidence leads
     and hardly any sighting contradicts them instead, or no marker tells them; a camera that was
-    moved, if the evidence leads. Where a solution rejects many sightings, one more jump is believed
-    that shows only with the slip that was learned, if it spares some, with no larger slip. Where a
-    solution stretches odometry beyond this slip, most of all over a way without markers, one more
-    jump is believed if the evidence leads decisively.
+    moved, if the evidence leads. Where a solution rejects many sightings, jumps that show only with
+    the slip that was learned are believed, all or the likeliest, if they spare some, with no larger
+    slip. Where a solution stretches odometry beyond this slip, most of all over a way without
+    markers, one more jump is believed if the evidence leads decisively.
     """
     bump = camera_bump(dataset)
     fit = _with_jumps(dataset, start, decide, bump)
@@ -614,9 +614,9 @@ def _lead_of_jumps(fit, other):
 
 
 def _overlooked(fit):
-    """Jumps with those of a Fit and more that many of its rejected sightings may tell, a list.
+    """List of Jumps: those of a Fit, and more that its rejected sightings may tell.
 
-    None where the slip is given, or the camera is late or was moved.
+    It is empty where few are rejected, the slip is given, or the camera is late or was moved.
     """
     m = fit.problem.measurements
     rejected = fit.problem.accepted.sightings.weight == 0

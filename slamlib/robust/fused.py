@@ -206,10 +206,10 @@ def _with_more_jumps(dataset, jumps, models):
     may have moved the camera, which may look like a jump.
     """
     states = _filter(dataset, jumps, models)
-    best = states[-1].likeliest
-    likeliest = _Models(*[field[[best]] for field in models])
     if camera_bump(dataset) is not None:
         return jumps, states
+    best = states[-1].likeliest
+    likeliest = _Models(*[field[[best]] for field in models])
     for more in with_overlooked(dataset, jumps, models.slip[best]):
         near = _near(dataset, more.start)
         gain = _log_densities(near, more, likeliest) - _log_densities(near, jumps, likeliest)
@@ -219,7 +219,7 @@ def _with_more_jumps(dataset, jumps, models):
 
 
 def _near(dataset, poses):
-    """The Dataset with sightings in STRETCH_FRAMES around these encoder poses (m,) only."""
+    """The Dataset with sightings at most STRETCH_FRAMES frames from encoder poses (m,) only."""
     aruco = dataset.aruco
     frame = np.unique(aruco.pose)
     number = np.searchsorted(frame, aruco.pose)

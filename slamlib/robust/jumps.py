@@ -347,8 +347,8 @@ def _cancel(s, drive, run):
     """Whether _Jumps move what follows by far less than the first and the last of them do.
 
     They also cancel if these two do as motions of the camera, which is then where it was before
-    (within CANCELLED m and rad), and all others are as small, unless markers seen before and after
-    them agree far better with these jumps.
+    (within CANCELLED m and rad), and all jumps between them are as small. But they stay if markers
+    seen before and after agree far better with them.
     """
     first = run[0].step
     last = run[-1].step + 1

@@ -293,6 +293,7 @@ class CameraBump(NamedTuple):
             covariance=se2.rotate_covariance(aruco.covariance, motion[:, 2])))
 
 
+@lru_cache(maxsize=2)
 def camera_bump(dataset: Dataset) -> CameraBump | None:
     """A possible CameraBump of a Dataset, or None if one place of the camera explains it as well.
 

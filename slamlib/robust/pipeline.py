@@ -139,12 +139,17 @@ def fit_from_odometry(measurements: Measurements, model: str = "arc",
     state = narrow_kernels(problem, initial_state(measurements, model))               # 4, 5
     if like is None:                                                                  # 6
         return memory_or_slip(problem, state)
-    decided = like.problem
-    problem = replace(problem, prior=decided.prior, memory_first=decided.memory_first,
-                      max_slip=decided.max_slip)
+    problem = _with_decisions(problem, like.problem)
     state = narrow_kernels(problem, replace(state, c=like.state.c), CAUCHY_SCALES[-1:])
     fit = refine(problem, state)
     return replace(fit, explanations=like.explanations, lead=like.lead)
+
+
+def _with_decisions(problem, decided):
+    """The Problem with the released groups, and what is sought of memory and slip, of another."""
+    prior = problem.measurements.calibration.prior(decided.prior.groups, decided.prior.width)
+    return replace(problem, prior=prior, memory_first=decided.memory_first,
+                   max_slip=decided.max_slip)
 
 
 def fit_from_previous(measurements: Measurements, previous: SlamResult,
@@ -152,10 +157,7 @@ def fit_from_previous(measurements: Measurements, previous: SlamResult,
     """The Fit of Measurements from a SlamResult, with another `model` if not None."""
     m = measurements
     problem = build_problem(m, model or previous.model, Noise(previous.slip), previous.wheel)
-    decided = previous.fit.problem
-    prior = m.calibration.prior(decided.prior.groups, decided.prior.width)
-    problem = replace(problem, prior=prior, memory_first=decided.memory_first,
-                      max_slip=decided.max_slip)
+    problem = _with_decisions(problem, previous.fit.problem)
     c = m.calibration.taken_from(previous.calibration, previous.c)
     state = state_from_poses(m, previous.poses[m.frame], previous.covariances[m.frame], c)
     state = narrow_kernels(problem, state, CAUCHY_SCALES[-1:])
