@@ -33,6 +33,7 @@ from slamlib.core.records import AntennaGuess, Dataset, UwbReadings
 from slamlib.core.sightings import sightings_by_frame
 from slamlib.core.vehicle import Vehicle
 from slamlib.robust import calibration, choices, factors, initialization
+from slamlib.robust.calibration import POSITIVE
 from slamlib.robust.choices import DECISIVE_LEAD, better_model, ids_of_places
 from slamlib.robust.fit import accepted_measurements
 from slamlib.robust.initialization import GROWTH, odometry_state, part_lengths
@@ -228,8 +229,22 @@ def test_nothing_is_released_in_a_clean_corridor(legs, monkeypatch):
             for groups in (["wheelbase"], ["wheel-scale", "marker-size"]):
                 wanted = choices._Proposal(
                     found.fit.explanations, calibration.prior(groups), -1e9)
-                c = choices._released(found.fit, wanted).state.c[choices.POSITIVE]
-                assert_allclose(c, calibration.stated[choices.POSITIVE], rtol=0.1)
+                c = choices._released(found.fit, wanted).state.c[POSITIVE]
+                assert_allclose(c, calibration.stated[POSITIVE], rtol=0.1)
+
+
+def test_rounds_end_where_the_calibration_is_impossible(monkeypatch, caplog):
+    """As where a clean corridor is explained by wheels and markers of a twentieth of their size."""
+    caplog.set_level("INFO", logger="slamlib.robust.fit")
+    dataset, _ = simulation.simulate("short", 1)
+    longer = replace(dataset.vehicle, wheelbase=0.42)
+    dataset = replace(dataset.without("uwb"), vehicle=longer)
+    estimate(dataset)
+    assert "round 2:" in caplog.text
+    caplog.clear()
+    monkeypatch.setattr(calibration, "MAX_RATIO", 1.0)
+    estimate(dataset)
+    assert "round 1:" in caplog.text and "round 2:" not in caplog.text
 
 
 def test_a_wrong_size_in_a_corridor_is_told_with_the_metre_in_doubt(monkeypatch):

@@ -79,6 +79,9 @@ SCALE = 15
 RANGE_LAG = 16
 ANTENNAS = slice(17, None)
 
+POSITIVE = np.r_[WHEELS, SIZE, SCALE]
+MAX_RATIO = 2.5              # of these, which are above zero, over what is stated, or the reverse
+
 
 @dataclass(frozen=True)
 class Calibration:
@@ -106,6 +109,13 @@ class Calibration:
             covariance = np.diag(sigma[RADII]**2) + np.outer(common, common)
             root[RADII, RADII] = np.linalg.cholesky(covariance)
         return Prior(groups=frozenset(groups), width=width, root=root)
+
+    def is_possible(self, c: np.ndarray) -> np.ndarray:
+        """Which entries of c (..., p) can be: wheels and scales, within MAX_RATIO of the stated."""
+        found = np.ones(c.shape, bool)
+        ratio = c[..., POSITIVE] / self.stated[POSITIVE]
+        found[..., POSITIVE] = (ratio > 1 / MAX_RATIO) & (ratio < MAX_RATIO)
+        return found
 
     def taken_from(self, other: "Calibration", values: np.ndarray) -> np.ndarray:
         """Values (p,) of another drive's Calibration where it has the entry, else as stated."""

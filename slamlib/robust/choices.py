@@ -34,7 +34,7 @@ from slamlib.core.errors import DatasetError
 from slamlib.core.increments import TYPICAL_SLIP
 from slamlib.core.records import ArucoReadings, Dataset
 from slamlib.core.sightings import GATE
-from slamlib.robust.calibration import RADII, SCALE, SIZE, WHEEL_SCALE, WHEELS, Prior
+from slamlib.robust.calibration import RADII, WHEEL_SCALE, WHEELS, Prior
 from slamlib.robust.error_memory import runs
 from slamlib.robust.factors import odometry_error, preintegrate_odometry
 from slamlib.robust.fit import (
@@ -76,14 +76,13 @@ AMBIGUOUS = 4.5              # log evidence within which explanations cannot be 
 MAX_GROUPS = 5               # number of groups that are wrong at once
 MAX_WIDE_SIGMAS = 4.0        # wide sigmas, of an entry; beyond them a statement is grossly wrong
 GROSS = 10.0                 # factor on the wide sigmas beyond MAX_WIDE_SIGMAS
-POSITIVE = np.r_[WHEELS, SIZE, SCALE]    # entries of the calibration that are above zero
-MAX_RATIO = 2.5              # of these over what is stated, or the reverse
 MIN_INFORMATION = 1e-3       # about an entry, in wide sigmas, below which it is not considered
 MAX_PROPOSALS = 5            # number of sets that are solved
 MAX_COST = 1.5               # ratio of sigmas of the last position, by what is released untold
 MIN_SPARED_SLIP = 4.0        # ratio of the slips without and with jumps that are believed
 MIN_JUMP_LEAD = 10.0         # log evidence by which a jump found at the solution is believed
-MIN_REJECTED = 0.005         # share of the sightings, above which jumps may have been overlooked
+MIN_REJECTED = 5             # number of sightings together, near which a jump may be overlooked
+REJECTED_FRAMES = 10         # number of successive frames in which these are
 
 SMALL_SLIP = 2e-3            # sqrt(m), above which slow errors of sensors may be the cause
 LARGE_SLIP = 0.01            # sqrt(m), above which errors of sensors mostly are
@@ -282,16 +281,8 @@ def _released(fit, proposal):
 
 def _is_solved(fit):
     """Whether the rounds of a Fit ended, with a possible calibration."""
-    is_possible = _is_possible(fit.problem.measurements.calibration, fit.state.c)
+    is_possible = fit.problem.measurements.calibration.is_possible(fit.state.c)
     return fit.converged and is_possible.all()
-
-
-def _is_possible(calibration, c):
-    """Which entries of c (..., p) can be: wheels and scales, within MAX_RATIO of the stated."""
-    found = np.ones(c.shape, bool)
-    ratio = c[..., POSITIVE] / calibration.stated[POSITIVE]
-    found[..., POSITIVE] = (ratio > 1 / MAX_RATIO) & (ratio < MAX_RATIO)
-    return found
 
 
 class _Sets(NamedTuple):
@@ -361,7 +352,7 @@ def _sets(calibration, likelihood, width):
     roots = _in_wide_sigmas(calibration, L, given)
     evidence, mean, variance = _posterior(likelihood, roots)
     c = calibration.stated + np.matvec(given, mean)
-    impossible = is_released & ~_is_possible(calibration, c)
+    impossible = is_released & ~calibration.is_possible(c)
     evidence[impossible.any(axis=1)] = -np.inf
     price = {group: _price(calibration, group) for group in groups}
     surprise = {group: _surprise(calibration, group) for group in groups}
@@ -522,10 +513,10 @@ def most_consistent(
     can look like jumps or places, so the Fit without jumps, and that with places, is free to find
     one before it is compared with the other. A few jumps are also believed if the evidence leads
     and hardly any sighting contradicts them instead, or no marker tells them; a camera that was
-    moved, if the evidence leads. Where a solution rejects many sightings, jumps that show only with
-    the slip that was learned are believed, all or the likeliest, if they spare some, with no larger
-    slip. Where a solution stretches odometry beyond this slip, most of all over a way without
-    markers, one more jump is believed if the evidence leads decisively.
+    moved, if the evidence leads. Where a solution rejects many sightings together, jumps that show
+    only with the slip that was learned are believed, all or the likeliest, if they spare some, with
+    no larger slip. Where a solution stretches odometry beyond this slip, most of all over a way
+    without markers, one more jump is believed if the evidence leads decisively.
     """
     bump = camera_bump(dataset)
     fit = _with_jumps(dataset, start, decide, bump)
@@ -616,12 +607,14 @@ def _lead_of_jumps(fit, other):
 def _overlooked(fit):
     """List of Jumps: those of a Fit, and more that its rejected sightings may tell.
 
-    It is empty where few are rejected, the slip is given, or the camera is late or was moved.
+    It is empty where few are rejected together, the slip is given, or the camera is late or was
+    moved.
     """
     m = fit.problem.measurements
     rejected = fit.problem.accepted.sightings.weight == 0
-    are_many = rejected.sum() > MIN_REJECTED * len(rejected)
-    if not are_many or not m.learned[0] or m.jumps.groups:
+    by_frame = np.bincount(m.sightings.row[rejected], minlength=len(m.frame))
+    are_together = np.convolve(by_frame, np.ones(REJECTED_FRAMES)).max() >= MIN_REJECTED
+    if not are_together or not m.learned[0] or m.jumps.groups:
         return []
     return with_overlooked(m.dataset, m.jumps, fit.problem.noise.slip)
 

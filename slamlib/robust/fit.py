@@ -228,7 +228,8 @@ def has_memory(fit: Fit) -> bool:
 def _settled_fit(problem, state, accept):
     """The Fit after rounds of wheels, noise and accepted measurements.
 
-    The Problem has the measurements that `accept` made before the last solution.
+    They end where the calibration is impossible. The Problem has the measurements that `accept`
+    made before the last solution.
     """
     m = problem.measurements
     posterior = None
@@ -250,7 +251,8 @@ def _settled_fit(problem, state, accept):
                  np.count_nonzero(accepted.sightings.weight), len(accepted.sightings.weight),
                  np.count_nonzero(accepted.ranges.weight), len(accepted.ranges.weight), changed)
         is_linear = _is_linear(problem, state, NEGLIGIBLE_MOVE)
-        if changed == 0 and is_linear:
+        is_possible = m.calibration.is_possible(state.c).all()
+        if (changed == 0 and is_linear) or not is_possible:
             break
         is_settled = changed <= NEGLIGIBLE_CHANGE * len(accepted.share) and is_linear
     return _fit(problem, optimum, posterior)

@@ -67,6 +67,8 @@ STRETCH_FRAMES = 20          # at most, of each
 MAX_ENTRIES = 5e7            # of the covariances of all filters that run side by side
 PRICE = 6.0                  # log density by which errors have memory, and by which the camera errs
 MIN_JUMP_GAIN = 10.0         # log likelihood by each of many jumps; the loss by each of a few
+MIN_REJECTED = 2             # number of sightings together, near which more jumps are sought
+REJECTED_FRAMES = 3          # number of successive frames in which these are
 # Rows of covariances; those of the markers follow
 POSE = slice(0, 3)
 WHEELS = slice(3, 6)
@@ -202,11 +204,14 @@ def _believed_jumps(dataset, slip):
 def _with_more_jumps(dataset, jumps, models):
     """The Jumps, with those that show by the slip that was learned if they are likelier.
 
-    Also the _State of filters with these _Models after each frame. None is sought where something
-    may have moved the camera, which may look like a jump.
+    Also the _State of filters with these _Models after each frame. None is sought where no
+    sightings are rejected together, or something may have moved the camera, which may look like a
+    jump.
     """
     states = _filter(dataset, jumps, models)
-    if camera_bump(dataset) is not None:
+    rejected = np.diff([state.rejected for state in states], prepend=0)
+    are_together = np.convolve(rejected, np.ones(REJECTED_FRAMES)).max() >= MIN_REJECTED
+    if not are_together or camera_bump(dataset) is not None:
         return jumps, states
     best = states[-1].likeliest
     likeliest = _Models(*[field[[best]] for field in models])

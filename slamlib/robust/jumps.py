@@ -16,6 +16,7 @@ is from a frame to the next one, and has the number of the earlier one.
 """
 
 import logging
+from bisect import bisect_left
 from dataclasses import dataclass, replace
 from functools import lru_cache, reduce
 from operator import attrgetter
@@ -330,38 +331,59 @@ def _without_bad_frames(s, drive, found, has_spike):
 def _without_cancelling(s, drive, jumps, has_spike, most):
     """The _Jumps, in their order, but those that cancel within so many steps at `most`."""
     kept = []
+    before = []                                          # poses of their frames, as they move them
     for jump in jumps:
+        here = drive.poses[jump.step]
+        if kept:
+            end = se2.compose(before[-1], kept[-1].increment)
+            way = se2.between(drive.poses[kept[-1].step + 1], here)
+            here = se2.compose(end, way)
         kept.append(jump)
+        before.append(here)
         if has_spike[jump.step]:
             continue
-        for k in reversed(range(len(kept) - 1)):
-            if jump.step - kept[k].step > most:
-                break
-            if _cancel(s, drive, kept[k:]):
-                del kept[k:]
-                break
+        begin = bisect_left(kept, jump.step - most, key=attrgetter("step"))
+        k = _last_cancelled(s, drive, kept[begin:], np.array(before[begin:]))
+        if k is not None:
+            del kept[begin + k:], before[begin + k:]
     return kept
 
 
-def _cancel(s, drive, run):
-    """Whether _Jumps move what follows by far less than the first and the last of them do.
+def _last_cancelled(s, drive, jumps, before):
+    """Number of the last of m _Jumps that cancels, by those after it up to the end, or None.
 
-    They also cancel if these two do as motions of the camera, which is then where it was before
-    (within CANCELLED m and rad), and all jumps between them are as small. But they stay if markers
-    seen before and after agree far better with them.
+    They cancel if they move what follows by far less than the first and the last of them do.
+    `before` (m, 3) are the poses of their frames, as the jumps move them. They also cancel if the
+    first and the last do as motions of the camera, which is then where it was before (within
+    CANCELLED m and rad), and all jumps between them are as small. But they stay if markers seen
+    before and after agree far better with them.
     """
+    if len(jumps) < 2:
+        return None
+    motion = np.array([jump.motion for jump in jumps])
+    size = size_of(motion)
+    most = CANCELLED * np.minimum(size, size[-1])
+    steps = np.array([jump.step for jump in jumps])
+    end = se2.compose(before[-1], jumps[-1].increment)
+    by_odometry = se2.between(drive.poses[steps], drive.poses[steps[-1] + 1])
+    off = size_of(se2.between(by_odometry, se2.between(before, end)))
+    off_as_camera = size_of(se2.compose(motion, motion[-1]))
+    largest_between = 0.0
+    for k in reversed(range(len(jumps) - 1)):
+        if off[k] < most[k]:
+            return k
+        is_as_camera = max(largest_between, off_as_camera[k]) < min(most[k], CANCELLED)
+        if is_as_camera and _agree_without(s, drive, jumps[k:]):
+            return k
+        largest_between = max(largest_between, size[k])
+    return None
+
+
+def _agree_without(s, drive, run):
+    """Whether markers seen before and after _Jumps agree nearly as well without them."""
     first = run[0].step
     last = run[-1].step + 1
     moved = reduce(_Drive.with_jump, run, drive)
-    off = se2.between(se2.between(drive.poses[first], drive.poses[last]),
-                      se2.between(moved.poses[first], moved.poses[last]))
-    motions = [jump.motion for jump in (run[0], run[-1])]
-    most = CANCELLED * min(map(size_of, motions))
-    if size_of(off) < most:
-        return True
-    largest_between = max((size_of(jump.motion) for jump in run[1:-1]), default=0.0)
-    if max(largest_between, size_of(se2.compose(*motions))) >= min(most, CANCELLED):
-        return False
     in_place = replace(moved, poses=drive.poses)
     cost = _cost_across(s, in_place, first, last)
     return cost <= MIN_COST_RATIO * _cost_across(s, moved, first, last)
