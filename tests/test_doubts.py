@@ -25,8 +25,9 @@ from slamlib.core.odometry import dead_reckoning
 from slamlib.core.records import AntennaGuess, Dataset, UwbReadings
 from slamlib.core.vehicle import Vehicle
 from slamlib.robust import file_doubts as files
+from slamlib.robust import part_faults
 from slamlib.robust.file_doubts import doubts_before_solving
-from slamlib.robust.part_faults import with_wheels_mended
+from slamlib.robust.part_faults import with_counts_mended
 from slamlib.studies.simulation import manoeuvre, simulate
 
 drive = cache(short)
@@ -129,7 +130,7 @@ def test_wheels_that_are_wrong_for_a_part_of_the_drive_are_doubted_there_and_men
     assert "use the counts changed so" in doubt.sentence
     first, last = map(int, re.search(r"poses (\d+) and (\d+)", doubt.sentence).groups())
     assert_allclose([first, last], [begin, end], atol=100)       # of 1 m
-    assert_allclose(path(with_wheels_mended(spoilt)), path(clean), atol=0.1)
+    assert_allclose(path(with_counts_mended(spoilt)), path(clean), atol=0.1)
     assert ate(path(spoilt), path(clean)) > 0.3
 
 
@@ -150,7 +151,58 @@ def test_wheels_that_are_wrong_for_most_of_the_drive_are_doubted_and_left():
     doubt, = doubts_before_solving(spoilt)
     assert doubt.what == "wheels-swapped"
     assert "use the counts" not in doubt.sentence
-    assert_array_equal(with_wheels_mended(spoilt).ticks, spoilt.ticks)
+    assert_array_equal(with_counts_mended(spoilt).ticks, spoilt.ticks)
+
+
+def lost(ticks, rng):
+    ticks[rng.random(ticks.shape) < 0.02] = 0
+    return ticks
+
+
+def late(ticks, rng):
+    """Some rows hold the counts of up to seven rows before them, too."""
+    for row in rng.integers(1, len(ticks) - 8, 20):
+        end = row + rng.integers(1, 8)
+        ticks[end] += ticks[row:end].sum(axis=0)
+        ticks[row:end] = 0
+    return ticks
+
+
+def doubled(ticks, rng):
+    ticks[rng.random(len(ticks)) < 0.05] *= 2
+    return ticks
+
+
+@pytest.mark.parametrize("spoil", [lost, late, doubled])
+def test_counts_that_are_lost_late_or_doubled_are_told_and_mended(spoil):
+    """They were 0.03 to 0.13 m off, with wrong wheels or sizes, or NEES above 20."""
+    clean, truth = drive(3)
+    clean = clean.without("uwb")
+    spoilt = replace(clean, ticks=spoil(clean.ticks.copy(), np.random.default_rng(3)))
+    doubt, = doubts_before_solving(spoilt)
+    first = np.flatnonzero((spoilt.ticks != clean.ticks).any(axis=1))[0] + 1
+    assert doubt.what == "encoder-rows" and f"the first at pose {first}," in doubt.sentence
+    for solve in (fuse, estimate):
+        error = ate(solve(spoilt).poses, truth.poses)
+        assert error < 1.2 * ate(solve(clean).poses, truth.poses) + 1e-3
+
+
+def test_counts_of_single_rows_are_mended_by_those_around_them():
+    mended = part_faults._gaps(np.array([90, 100, 0, 0, 106, 100, 0, 200, 0, 200, 100]))
+    assert_array_equal(mended, [90, 100, 104, 104, 104, 100, 100, 100, 100, 100, 100])
+    stops = np.array([100, 50, 4, 0, 0, 3, 50, 100, 0, -100, 0] + 11 * [0] + [100])
+    assert_array_equal(part_faults._gaps(stops), stops)
+    twice = np.array([90, 92, 188, 192, 98, -300, 102, 104])
+    assert_array_equal(part_faults._peaks(twice), [90, 92, 92, 98, 98, -300, 102, 104])
+
+
+def test_a_vehicle_that_stops_for_one_row_by_the_markers_has_lost_no_counts():
+    clean = drive(3)[0].without("uwb")
+    rows = np.arange(50, 1950, 40)
+    pose = clean.aruco.pose + np.searchsorted(rows, clean.aruco.pose, side="right")
+    stops = replace(aruco(clean, pose=pose), ticks=np.insert(clean.ticks, rows, 0, axis=0))
+    assert (part_faults._gaps(stops.ticks[:, 0]) != stops.ticks[:, 0]).any()
+    assert not part_faults.wrong_counts(stops).any()
 
 
 # Drives with nothing to doubt: functions of a simulated drive, its truth and a random generator.

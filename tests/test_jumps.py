@@ -194,7 +194,7 @@ def test_a_small_push_is_found_with_the_slip_that_was_learned(pose):
 
 
 def test_a_small_push_is_found_on_a_long_drive():
-    """By 3 cm; 16 of 5,366 sightings were rejected instead, without a word, and it was 11 mm off."""
+    """By 3 cm; 16 of 5,366 sightings were rejected without a word, and it was 11 mm off."""
     dataset, truth = pushed(*simulate("long", seed=3), 6001, np.array([0, 0.03, 0]))
     found = estimate(dataset.without("uwb"))
     assert [doubt.what for doubt in solution_doubts(found)] == ["encoder"]

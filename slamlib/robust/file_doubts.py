@@ -22,10 +22,11 @@ from slamlib.robust.part_faults import (
     contradictions,
     moving_increments,
     other_axes,
+    with_counts_mended,
     with_headings_reversed,
     with_other_axes,
     with_sightings_inverted,
-    with_wheels_mended,
+    wrong_counts,
 )
 
 MIN_RANGES_PER_ANTENNA = 4
@@ -62,7 +63,7 @@ class Doubt:
 def doubts_before_solving(dataset: Dataset) -> list[Doubt]:
     """List of Doubts about the files of a Dataset, where enough is known."""
     doubts = []
-    for check in (motion_doubts, range_units, cut_counts):
+    for check in (motion_doubts, range_units, cut_counts, single_rows):
         with suppress(np.linalg.LinAlgError):              # where increments have no covariance
             doubts += list(check(dataset))
         if any(doubt.what == "encoder-dead" for doubt in doubts):
@@ -203,7 +204,7 @@ def range_units(dataset: Dataset) -> Iterator[Doubt]:
     Of the path while its heading is known, with its wheels mended, and of antennas with
     MIN_RANGES_PER_ANTENNA on it.
     """
-    dataset = with_wheels_mended(dataset)
+    dataset = with_counts_mended(dataset)
     guesses = dataset.antenna_guess
     if dataset.uwb is None or guesses is None:
         return
@@ -246,6 +247,18 @@ def cut_counts(dataset: Dataset) -> Iterator[Doubt]:
             f"All counts of encoderReading.txt are multiples of {divisor}. If the rest of each row "
             "was cut off, every distance by the wheels is too short, by an unknown factor."), (
             "Look at how the counts were read, and at ticks_per_revolution in vehicle.toml."))
+
+
+def single_rows(dataset: Dataset) -> Iterator[Doubt]:
+    """Doubt, if there are `wrong_counts`."""
+    wrong = wrong_counts(dataset)
+    rows = np.flatnonzero((2 * np.abs(wrong) > np.abs(dataset.ticks - wrong)).any(axis=1))
+    if len(rows):
+        yield Doubt("encoder-rows", (
+            f"In encoderReading.txt, {len(rows)} rows, the first at pose {rows[0] + 1}, have lost "
+            "counts, have them late, or twice: by the markers the wheels go on as before and after "
+            "them. Problem 2's fusion and problems 3 and 4 assume so."), (
+            "Look at how the counts were read."))
 
 
 def common_divisor(ticks: np.ndarray) -> int:

@@ -56,7 +56,7 @@ from slamlib.robust.jumps import (
     find_jumps,
     with_overlooked,
 )
-from slamlib.robust.part_faults import camera_bump, constant_delay, with_wheels_mended
+from slamlib.robust.part_faults import camera_bump, constant_delay, with_counts_mended
 
 SLIPS = TYPICAL_SLIP * SLIP_FACTOR ** np.arange(-1.0, 4.0)     # sqrt(m), of the first filters
 FINE_STEPS = 1.4 ** np.arange(-2.0, 3.0)     # slips of the last filters, over the likeliest one
@@ -160,7 +160,7 @@ def fuse(dataset: Dataset, slip: float | None = None) -> LearnedFusion:
     """
     require(isinstance(dataset, Dataset), "fuse", "a Dataset", dataset)
     dataset = dataset.stating({"slip": slip}, "fuse")
-    dataset = _with_delay_mended(with_wheels_mended(dataset))
+    dataset = _with_delay_mended(with_counts_mended(dataset))
     slip = dataset.vehicle.slip
     dataset = _with_camera_mended(dataset, slip or TYPICAL_SLIP)
     jumps = _believed_jumps(dataset, slip or TYPICAL_SLIP)

@@ -6,6 +6,9 @@ with other axes or signs are [A (x, y), det(A) heading], A one of the eight symm
 The stretch is the one in which they contradict each other less by most in all. Such counts are
 mended.
 
+Rows may lose counts, or have them late or twice. A wheel then stops for a few rows, or turns far
+more than in those around. It is mended if increments by markers agree better then.
+
 Something may move the camera: from then on, it is elsewhere in the vehicle than stated. A camera
 that is off by c = [x, y, turn] changes the position of an increment [p, h] by
 
@@ -25,6 +28,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from slamlib.core import increments, odometry, se2
 from slamlib.core.marker_increments import (
@@ -48,6 +52,12 @@ MIN_MOTION_SIGMAS = 5.0   # sigmas by markers of distance or turn, from which on
 AGREEMENT_RATIO = 0.1     # of an increment
 AGREEMENT_SIGMAS = 3.0    # sigmas of the increment by markers
 MIN_AGREEING_SHARE = 0.7  # of the increments with an accepted A
+MAX_LOST = 10             # rows in which a wheel that moves has no counts
+MIN_SPEED = 5             # counts in a row, of a wheel that moves
+SLOW = 0.5                # of the median speed, below which a wheel may stop
+AROUND = 3                # rows before and after
+PEAK = 1.5                # ratio of counts in a row to those in most rows around it
+MIN_MENDED_GAIN = 20.0    # of squared residuals, each up to a limit, by what is mended
 MIN_GAIN_SIGMAS = 2.5     # sigmas of the number of increments that agree in addition
 MIN_SPANS = 3.0           # of increments, that a stretch is longer; one jump spoils two
 FINER = 20                # times, in which the search for the ends of a stretch becomes finer
@@ -148,7 +158,77 @@ def with_other_axes(dataset: Dataset, wheels: np.ndarray, poses: np.ndarray) -> 
     return np.concatenate([wheels @ MOTIONS, one_reversed @ MOTIONS[:4]])
 
 
-def with_wheels_mended(dataset: Dataset) -> Dataset:
+def with_counts_mended(dataset: Dataset) -> Dataset:
+    """The Dataset without `wrong_counts`, and wheels mended that are exchanged or reversed."""
+    return _with_wheels_mended(replace(dataset, ticks=dataset.ticks - wrong_counts(dataset)))
+
+
+@lru_cache(maxsize=2)
+def wrong_counts(dataset: Dataset) -> np.ndarray:
+    """What is wrong in counts (n, 2) of rows that have lost some, have them late, or twice.
+
+    That is, a wheel has no counts in at most MAX_LOST rows, or far more in one row, and many just
+    before and after. Each of both kinds counts only if increments by markers agree better without.
+    """
+    markers, wheels, sigma, poses = moving_increments(dataset)
+    wrong = np.zeros_like(dataset.ticks)
+    if len(wheels) < MIN_COUNT:
+        return wrong
+
+    def cost(by_wheels):
+        return _cost(markers, by_wheels, sigma, _by_camera(by_wheels))
+
+    least = cost(wheels)
+    for kind in (_gaps, _peaks):
+        ticks = dataset.ticks - wrong
+        mended = np.stack([kind(counts) for counts in ticks.T], axis=1)
+        if (mended == ticks).all():
+            continue
+        cost_of_mended = cost(_increments(_path(replace(dataset, ticks=mended)), poses))
+        scale = max(1.0, cost_of_mended / len(wheels))
+        log.info("wheels: counts of single rows, cost %.1f, mended %.1f", least, cost_of_mended)
+        if least - cost_of_mended > MIN_MENDED_GAIN * scale:
+            wrong = dataset.ticks - mended
+            least = cost_of_mended
+    return wrong
+
+
+def _gaps(counts):
+    """The counts (n,) of a wheel, if it never stands still for a few rows only.
+
+    Where the counts after a gap are nearer to those of all its rows together, they came late and
+    are divided; else the rows of the gap get what is usual before and after.
+    """
+    mended = counts.copy()
+    moved = np.flatnonzero(counts)
+    rows = np.diff(moved)
+    is_gap = (rows > 1) & (rows <= MAX_LOST + 1) & _go_on(counts[moved[:-1]], counts[moved[1:]])
+    for k in np.flatnonzero(is_gap):
+        before = mended[moved[k]]                        # divided if it is behind another gap
+        total = after = counts[moved[k + 1]]
+        if 2 * after / before < 1 + rows[k]:
+            total += (rows[k] - 1) * (before + after) / 2
+        edges = np.rint(np.linspace(0, total, rows[k] + 1))
+        mended[moved[k] + 1:moved[k + 1] + 1] = np.diff(edges)
+    return mended
+
+
+def _peaks(counts):
+    """The counts (n,) of a wheel, if it never turns far more in a row than in most around it."""
+    around = sliding_window_view(np.pad(counts, AROUND, mode="edge"), 2 * AROUND + 1)
+    usual = np.rint(np.median(around, axis=1)).astype(counts.dtype)
+    is_peak = (np.abs(counts) > PEAK * np.abs(usual)) & _go_on(usual, counts)
+    return np.where(is_peak, usual, counts)
+
+
+def _go_on(before, after):
+    """Whether a wheel moves with counts `before` (m,) and `after`, as it mostly does."""
+    speed = np.minimum(np.abs(before), np.abs(after))
+    least = SLOW * np.median(np.abs(before)) if len(before) else 0.0
+    return (speed >= max(MIN_SPEED, least)) & (np.sign(before) == np.sign(after))
+
+
+def _with_wheels_mended(dataset):
     """The Dataset with its counts mended in a stretch in which wheels are exchanged or reversed.
 
     It is as it was where that is most of the drive and the camera may as well have other axes. Of

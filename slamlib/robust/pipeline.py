@@ -26,7 +26,7 @@ from slamlib.robust.initialization import initial_state, state_from_poses
 from slamlib.robust.jumps import NO_JUMPS
 from slamlib.robust.linear import build_problem
 from slamlib.robust.measurements import Measurements, Noise, measure
-from slamlib.robust.part_faults import with_wheels_mended
+from slamlib.robust.part_faults import with_counts_mended
 from slamlib.robust.result import SlamResult, slam_result
 
 log = logging.getLogger(__name__)
@@ -75,7 +75,7 @@ def estimate(dataset: Dataset, slip: float | None = None, model: str | None = No
     started = time.perf_counter()
     require(isinstance(dataset, Dataset), "estimate", "a Dataset", dataset)
     require_rows(dataset, poses, "estimate")
-    dataset = with_wheels_mended(dataset)
+    dataset = with_counts_mended(dataset)
     require_same_drive(dataset, previous)
     require(model in (None, *MODELS), "estimate", f"{' or '.join(MODELS)} for model", model)
     options = {"slip": slip, "marker_noise_factor": marker_noise_factor,
