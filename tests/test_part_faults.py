@@ -156,10 +156,10 @@ def test_two_faults_of_a_wheel_are_no_motion_of_the_camera():
 
 
 def test_a_jump_among_many_wrong_labels_is_found():
-    """Counts are lost beside 15 % wrong labels, which stay rejected: 0.024 m off without it."""
+    """Most counts are lost beside 15 % wrong labels, which stay rejected: 0.018 m off without."""
     dataset, truth = short(31, mislabelled=0.15)
-    lost = counts(slice(1000, 1008), lambda ticks: 0 * ticks)(dataset)
-    found = estimate(lost.without("uwb"))
+    fewer = counts(slice(1000, 1008), lambda ticks: ticks // 4)(dataset)
+    found = estimate(fewer.without("uwb"))
     assert aligned_ate(found, truth) < 0.005 and len(found.jumps.start) == 1
 
 
