@@ -173,8 +173,14 @@ def doubled(ticks, rng):
     return ticks
 
 
-@pytest.mark.parametrize("spoil", [lost, late, doubled])
-def test_counts_that_are_lost_late_or_doubled_are_told_and_mended(spoil):
+def spikes(ticks, _):
+    """Two of them cancel."""
+    ticks[[1004, 1404, 1412], 0] += [4096, 4096, -4096]
+    return ticks
+
+
+@pytest.mark.parametrize("spoil", [lost, late, doubled, spikes])
+def test_counts_of_single_rows_that_are_wrong_are_told_and_mended(spoil):
     """They were 0.03 to 0.13 m off, with wrong wheels or sizes, or NEES above 20."""
     clean, truth = drive(3)
     clean = clean.without("uwb")
@@ -193,7 +199,8 @@ def test_counts_of_single_rows_are_mended_by_those_around_them():
     stops = np.array([100, 50, 4, 0, 0, 3, 50, 100, 0, -100, 0] + 11 * [0] + [100])
     assert_array_equal(part_faults._gaps(stops), stops)
     twice = np.array([90, 92, 188, 192, 98, -300, 102, 104])
-    assert_array_equal(part_faults._peaks(twice), [90, 92, 92, 98, 98, -300, 102, 104])
+    assert_array_equal(part_faults._peaks(twice), [90, 92, 92, 98, 98, 104, 102, 104])
+    assert_array_equal(part_faults._peaks(-twice), [-90, -92, -92, -98, -98, -104, -102, -104])
 
 
 def test_a_vehicle_that_stops_for_one_row_by_the_markers_has_lost_no_counts():

@@ -118,7 +118,7 @@ def test_a_jump_is_not_over_a_pair_that_agrees():
 
 
 def test_shares_of_a_jump_by_hand():
-    """A jump in one of four steps; of the steps 3, 4, 5 and 6 the second has a spike."""
+    """A jump in one of four steps; in the second of the steps 3, 4, 5 and 6 wheels slip."""
     jump = np.array([0.4, 0.0, 0.2])
     found = jumps.NO_JUMPS.joined_by(2, 6, jump, 0 * jump, count=9)
     start = np.array([0, 2, 3, 0, 6])
@@ -127,23 +127,14 @@ def test_shares_of_a_jump_by_hand():
     motion, covariance = found.added(start, end)
     assert_allclose(motion[1], jump / 4)
     assert_allclose(covariance[1], np.diag([0.04, 0.04, 0.01]))
-    spike = replace(found, chance=np.cumsum([1, 1, 1, 1, 1e6, 1, 1, 1, 1]))
-    assert_allclose(spike.share(start, end)[:, 0], [0, 0, 1, 1, 0], atol=1e-5)
-
-
-def test_a_spike_is_likely_to_be_the_jump_also_in_reverse():
-    ticks = np.full((400, 2), -127)
-    ticks[7, 0] = -4000
-    chance = np.diff(jumps._chance(ticks, np.arange(400) == 9))
-    assert np.flatnonzero(chance > 1).tolist() == [6, 8]               # into poses 7 and 9
+    slips = replace(found, chance=np.cumsum([1, 1, 1, 1, 1e6, 1, 1, 1, 1]))
+    assert_allclose(slips.share(start, end)[:, 0], [0, 0, 1, 1, 0], atol=1e-5)
 
 
 FAULTS = {                                                # and the largest ratio of the ATE
     "carried": (lambda d: carried(d, 1001, 1301), np.inf),
     "pushed by 6 cm": (lambda d: carried(d, 1001, 1007), 1.5),
     "one wheel dead": (counts(slice(1003, 1053), lambda ticks: ticks * [0, 1]), 1.5),
-    "spikes, two of which cancel": (counts(
-        [1004, 1404, 1412], lambda ticks: ticks + np.outer([1, 1, -1], [4096, 0])), 1.5),
     "dead for a third": (counts(slice(1334, None), lambda ticks: 0 * ticks), 4.0)}
 
 

@@ -59,8 +59,7 @@ CANCELLED = 0.3              # ratio of the size of all jumps together to that o
 MIN_COST_RATIO = 1.5         # without jumps and with them, of markers seen before and after
 MAX_UNSUPPORTED = 2          # number of jumps; sensors that have more of them may be poor
 UNKNOWN_SIGMA = np.array([10.0, 10.0, np.pi])  # m, m, rad, if no marker tells
-SPIKE = 3.0                  # ratio to the counts of fast steps, above which a step is the jump
-SPIKE_CHANCE = 1e6           # of a jump in such a step, relative to others
+SLIPPING_CHANCE = 1e6        # of a jump in a row in which wheels slip, relative to others
 
 
 @dataclass(frozen=True)
@@ -92,8 +91,8 @@ class Jumps:
 
     @property
     def are_few(self) -> bool:
-        """Whether there are jumps, but few that no spike of the counts supports."""
-        unsupported = np.sum(self._chances() < SPIKE_CHANCE)
+        """Whether there are jumps, but few that no slipping wheels support."""
+        unsupported = np.sum(self._chances() < SLIPPING_CHANCE)
         return len(self.start) > 0 and unsupported <= MAX_UNSUPPORTED
 
     @property
@@ -231,7 +230,8 @@ def find_jumps(dataset: Dataset) -> Jumps:
                  jump.sigma[0])
         jumps = jumps._with(start=start, end=end, increment=jump.increment,
                             by_odometry=jump.by_odometry, sigma=jump.sigma)
-    return replace(jumps, chance=_chance(dataset.ticks, slipping)) if found else jumps
+    chance = np.cumsum(np.where(slipping, SLIPPING_CHANCE, 1.0))
+    return replace(jumps, chance=chance) if found else jumps
 
 
 def _sightings_by_marker(dataset):
@@ -265,20 +265,6 @@ def with_overlooked(dataset: Dataset, jumps: Jumps, slip: float) -> list[Jumps]:
     return alternatives[:len(more)]                      # one is all
 
 
-def _chance(ticks, slipping):
-    """Chance (n,) of a jump in the steps up to each pose.
-
-    It is large in spikes of the counts, and in rows in which the wheels are `slipping` (n,).
-    """
-    return np.cumsum(np.where(_spikes(ticks) | slipping, SPIKE_CHANCE, 1.0))
-
-
-def _spikes(ticks):
-    """Rows (n,), bool, with far larger counts than all others."""
-    counts = np.abs(ticks).max(axis=1)
-    return counts > SPIKE * np.quantile(counts, 0.99)
-
-
 def cauchy_cost(squared: np.ndarray) -> np.ndarray:
     """Cauchy cost, twice a negative log likelihood, of squared Mahalanobis distances (m,)."""
     return GATE * np.log1p(squared / GATE)
@@ -303,8 +289,7 @@ def _found(ticks, s, drive, slipping):
         unknown = dict.fromkeys(dead, 2 * _usual(drive)) | unknown
         tried = _bridged(s, drive, suspects, rank, unknown)
     found = [jump for jump in tried if jump.found]
-    has_spike = _rows_in_steps(_spikes(ticks), s.frame) > 0
-    return _without_bad_frames(s, drive, found + _beside(s, drive, found, rank), has_spike)
+    return _without_bad_frames(s, drive, found + _beside(s, drive, found, rank))
 
 
 def _beside(s, drive, found, rank):
@@ -316,19 +301,18 @@ def _beside(s, drive, found, rank):
     return [jump for jump in _bridged(s, moved, beside, rank, {}) if jump.found]
 
 
-def _without_bad_frames(s, drive, found, has_spike):
+def _without_bad_frames(s, drive, found):
     """The _Jumps but those that soon cancel: in between, sightings are wrong, or late.
 
-    The nearest ones cancel first. Jumps of which the last one is in a step with a spike of the
-    counts stay; `has_spike` is a mask (f-1,).
+    The nearest ones cancel first.
     """
     kept = sorted(found, key=attrgetter("step"))
     for most in (MAX_BAD_FRAMES, MAX_BAD_SHARE * len(drive.poses)):
-        kept = _without_cancelling(s, drive, kept, has_spike, most)
+        kept = _without_cancelling(s, drive, kept, most)
     return kept
 
 
-def _without_cancelling(s, drive, jumps, has_spike, most):
+def _without_cancelling(s, drive, jumps, most):
     """The _Jumps, in their order, but those that cancel within so many steps at `most`."""
     kept = []
     before = []                                          # poses of their frames, as they move them
@@ -340,8 +324,6 @@ def _without_cancelling(s, drive, jumps, has_spike, most):
             here = se2.compose(end, way)
         kept.append(jump)
         before.append(here)
-        if has_spike[jump.step]:
-            continue
         begin = bisect_left(kept, jump.step - most, key=attrgetter("step"))
         k = _last_cancelled(s, drive, kept[begin:], np.array(before[begin:]))
         if k is not None:

@@ -52,7 +52,7 @@ MIN_MOTION_SIGMAS = 5.0   # sigmas by markers of distance or turn, from which on
 AGREEMENT_RATIO = 0.1     # of an increment
 AGREEMENT_SIGMAS = 3.0    # sigmas of the increment by markers
 MIN_AGREEING_SHARE = 0.7  # of the increments with an accepted A
-MAX_LOST = 10             # rows in which a wheel that moves has no counts
+MAX_LOST = 20             # rows in which a wheel that moves has no counts
 MIN_SPEED = 5             # counts in a row, of a wheel that moves
 SLOW = 0.5                # of the median speed, below which a wheel may stop
 AROUND = 3                # rows before and after
@@ -185,7 +185,7 @@ def wrong_counts(dataset: Dataset) -> np.ndarray:
         if (mended == ticks).all():
             continue
         cost_of_mended = cost(_increments(_path(replace(dataset, ticks=mended)), poses))
-        scale = max(1.0, cost_of_mended / len(wheels))
+        scale = max(1.0, cost_of_mended / (2 * len(wheels)))         # x and y of each
         log.info("wheels: counts of single rows, cost %.1f, mended %.1f", least, cost_of_mended)
         if least - cost_of_mended > MIN_MENDED_GAIN * scale:
             wrong = dataset.ticks - mended
@@ -217,7 +217,7 @@ def _peaks(counts):
     """The counts (n,) of a wheel, if it never turns far more in a row than in most around it."""
     around = sliding_window_view(np.pad(counts, AROUND, mode="edge"), 2 * AROUND + 1)
     usual = np.rint(np.median(around, axis=1)).astype(counts.dtype)
-    is_peak = (np.abs(counts) > PEAK * np.abs(usual)) & _go_on(usual, counts)
+    is_peak = (np.abs(counts) > PEAK * np.abs(usual)) & _go_on(usual, usual)
     return np.where(is_peak, usual, counts)
 
 
