@@ -81,7 +81,7 @@ MAX_PROPOSALS = 5            # number of sets that are solved
 MAX_COST = 1.5               # ratio of sigmas of the last position, by what is released untold
 MIN_SPARED_SLIP = 4.0        # ratio of the slips without and with jumps that are believed
 MIN_JUMP_LEAD = 10.0         # log evidence by which a jump found at the solution is believed
-MIN_REJECTED = 5             # number of sightings together, near which a jump may be overlooked
+MIN_REJECTED = 3             # number of sightings together, near which a jump may be overlooked
 REJECTED_FRAMES = 10         # number of successive frames in which these are
 
 SMALL_SLIP = 2e-3            # sqrt(m), above which slow errors of sensors may be the cause

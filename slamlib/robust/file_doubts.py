@@ -255,10 +255,10 @@ def single_rows(dataset: Dataset) -> Iterator[Doubt]:
     rows = np.flatnonzero((2 * np.abs(wrong) > np.abs(dataset.ticks - wrong)).any(axis=1))
     if len(rows):
         yield Doubt("encoder-rows", (
-            f"In encoderReading.txt, {len(rows)} rows, the first at pose {rows[0] + 1}, have lost "
-            "counts, have them late, or twice: by the markers the wheels go on as before and after "
-            "them. Problem 2's fusion and problems 3 and 4 assume so."), (
-            "Look at how the counts were read."))
+            f"In {len(rows)} of {len(wrong)} rows of encoderReading.txt, the first at pose "
+            f"{rows[0] + 1}, counts are lost, late or doubled: by the markers the wheels go on as "
+            "in the rows around. Problem 2's fusion and problems 3 and 4 assume so."),
+            "Look at how the counts were read.")
 
 
 def common_divisor(ticks: np.ndarray) -> int:

@@ -68,7 +68,7 @@ MAX_ENTRIES = 5e7            # of the covariances of all filters that run side b
 PRICE = 6.0                  # log density by which errors have memory, and by which the camera errs
 MIN_JUMP_GAIN = 10.0         # log likelihood by each of many jumps; the loss by each of a few
 MIN_REJECTED = 2             # number of sightings together, near which more jumps are sought
-REJECTED_FRAMES = 3          # number of successive frames in which these are
+REJECTED_FRAMES = 10         # number of successive frames in which these are
 # Rows of covariances; those of the markers follow
 POSE = slice(0, 3)
 WHEELS = slice(3, 6)

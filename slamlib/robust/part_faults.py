@@ -55,9 +55,9 @@ MIN_AGREEING_SHARE = 0.7  # of the increments with an accepted A
 MAX_LOST = 20             # rows in which a wheel that moves has no counts
 MIN_SPEED = 5             # counts in a row, of a wheel that moves
 SLOW = 0.5                # of the median speed, below which a wheel may stop
-AROUND = 3                # rows before and after
+AROUND = 5                # rows before and after
 PEAK = 1.5                # ratio of counts in a row to those in most rows around it
-MIN_MENDED_GAIN = 20.0    # of squared residuals, each up to a limit, by what is mended
+MIN_MENDED_GAIN = 10.0    # of squared residuals, each up to a limit, by what is mended
 MIN_GAIN_SIGMAS = 2.5     # sigmas of the number of increments that agree in addition
 MIN_SPANS = 3.0           # of increments, that a stretch is longer; one jump spoils two
 FINER = 20                # times, in which the search for the ends of a stretch becomes finer
@@ -167,53 +167,69 @@ def with_counts_mended(dataset: Dataset) -> Dataset:
 def wrong_counts(dataset: Dataset) -> np.ndarray:
     """What is wrong in counts (n, 2) of rows that have lost some, have them late, or twice.
 
-    That is, a wheel has no counts in at most MAX_LOST rows, or far more in one row, and many just
-    before and after. Each of both kinds counts only if increments by markers agree better without.
+    That is, a wheel has no counts in at most MAX_LOST rows, and many just before and after, or far
+    more in a few rows than around. As long as increments by markers agree better with what one of
+    the three would be without, the one that gains most is believed.
     """
     markers, wheels, sigma, poses = moving_increments(dataset)
-    wrong = np.zeros_like(dataset.ticks)
+    ticks = dataset.ticks
     if len(wheels) < MIN_COUNT:
-        return wrong
+        return np.zeros_like(ticks)
 
-    def cost(by_wheels):
+    def cost(ticks):
+        by_wheels = _increments(_path(replace(dataset, ticks=ticks)), poses)
         return _cost(markers, by_wheels, sigma, _by_camera(by_wheels))
 
-    least = cost(wheels)
-    for kind in (_gaps, _peaks):
-        ticks = dataset.ticks - wrong
-        mended = np.stack([kind(counts) for counts in ticks.T], axis=1)
-        if (mended == ticks).all():
-            continue
-        cost_of_mended = cost(_increments(_path(replace(dataset, ticks=mended)), poses))
-        scale = max(1.0, cost_of_mended / (2 * len(wheels)))         # x and y of each
-        log.info("wheels: counts of single rows, cost %.1f, mended %.1f", least, cost_of_mended)
-        if least - cost_of_mended > MIN_MENDED_GAIN * scale:
-            wrong = dataset.ticks - mended
-            least = cost_of_mended
-    return wrong
+    least = cost(ticks)
+    while True:
+        found = {}
+        for kind in (_without_late, _without_lost, _without_peaks):
+            mended = np.stack([kind(counts) for counts in ticks.T], axis=1)
+            if (mended != ticks).any():
+                found[cost(mended)] = mended
+        best = min(found, default=np.inf)
+        scale = max(1.0, best / (2 * len(wheels)))       # x and y of each
+        if not least - best > MIN_MENDED_GAIN * scale:
+            return dataset.ticks - ticks
+        log.info("wheels: counts of single rows mended, cost %.1f, before %.1f", best, least)
+        ticks = found[best]
+        least = best
 
 
-def _gaps(counts):
-    """The counts (n,) of a wheel, if it never stands still for a few rows only.
+def _without_late(counts):
+    """The counts (n,) of a wheel, if those after each gap are of all its rows."""
+    return _without_gaps(counts, lambda before, after, rows: True)
 
-    Where the counts after a gap are nearer to those of all its rows together, they came late and
-    are divided; else the rows of the gap get what is usual before and after.
+
+def _without_lost(counts):
+    """The counts (n,) of a wheel, if those after a gap are of all its rows where this is nearer."""
+    return _without_gaps(counts, lambda before, after, rows: 2 * after > (1 + rows) * before)
+
+
+def _without_gaps(counts, is_late):
+    """The counts (n,) of a wheel that never stands still for a few rows only.
+
+    Where `is_late`, by counts before and after a gap and its `rows` with that after it, these share
+    the counts after it. Else the rows of the gap get what is usual before and after.
     """
     mended = counts.copy()
     moved = np.flatnonzero(counts)
     rows = np.diff(moved)
     is_gap = (rows > 1) & (rows <= MAX_LOST + 1) & _go_on(counts[moved[:-1]], counts[moved[1:]])
     for k in np.flatnonzero(is_gap):
-        before = mended[moved[k]]                        # divided if it is behind another gap
-        total = after = counts[moved[k + 1]]
-        if 2 * after / before < 1 + rows[k]:
-            total += (rows[k] - 1) * (before + after) / 2
-        edges = np.rint(np.linspace(0, total, rows[k] + 1))
-        mended[moved[k] + 1:moved[k + 1] + 1] = np.diff(edges)
+        first = moved[k] + 1
+        last = moved[k + 1]
+        before = mended[first - 1]                       # shared if it is behind another gap
+        after = counts[last]
+        if is_late(abs(before), abs(after), rows[k]):
+            edges = np.rint(np.linspace(0, after, rows[k] + 1))
+            mended[first:last + 1] = np.diff(edges)
+        else:
+            mended[first:last] = np.rint((before + after) / 2)
     return mended
 
 
-def _peaks(counts):
+def _without_peaks(counts):
     """The counts (n,) of a wheel, if it never turns far more in a row than in most around it."""
     around = sliding_window_view(np.pad(counts, AROUND, mode="edge"), 2 * AROUND + 1)
     usual = np.rint(np.median(around, axis=1)).astype(counts.dtype)
