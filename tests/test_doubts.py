@@ -201,11 +201,11 @@ def test_counts_of_single_rows_that_are_wrong_are_told_and_mended(spoil):
 def test_counts_of_single_rows_are_mended_by_those_around_them():
     counts = np.array([90, 100, 0, 0, 106, 100, 0, 200, 0, 200, 100])
     mended = [90, 100, 103, 103, 106, 100, 100, 100, 100, 100, 100]
-    assert_array_equal(part_faults._without_lost(counts), mended)
+    assert_array_equal(part_faults._without_gaps(counts, all_late=False), mended)
     late = [90, 100, 35, 36, 35, 100, 100, 100, 100, 100, 100]
-    assert_array_equal(part_faults._without_late(-counts), -np.array(late))
+    assert_array_equal(part_faults._without_gaps(-counts, all_late=True), -np.array(late))
     stops = np.array([100, 50, 4, 0, 0, 3, 50, 100, 0, -100, 0] + 21 * [0] + [100])
-    assert_array_equal(part_faults._without_lost(stops), stops)
+    assert_array_equal(part_faults._without_gaps(stops, all_late=False), stops)
     twice = np.array([90, 92, 188, 192, 98, -300, 102, 104, 104])
     mended = [90, 92, 92, 98, 98, 104, 102, 104, 104]
     assert_array_equal(part_faults._without_peaks(twice), mended)
@@ -217,7 +217,8 @@ def test_a_vehicle_that_stops_for_one_row_by_the_markers_has_lost_no_counts():
     rows = np.arange(50, 1950, 40)
     pose = clean.aruco.pose + np.searchsorted(rows, clean.aruco.pose, side="right")
     stops = replace(aruco(clean, pose=pose), ticks=np.insert(clean.ticks, rows, 0, axis=0))
-    assert (part_faults._without_lost(stops.ticks[:, 0]) != stops.ticks[:, 0]).any()
+    right = stops.ticks[:, 0]
+    assert (part_faults._without_gaps(right, all_late=False) != right).any()
     assert not part_faults.wrong_counts(stops).any()
 
 

@@ -24,7 +24,7 @@ one with the greatest likelihood ratio, and its counts are not used.
 
 import logging
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -160,7 +160,10 @@ def with_other_axes(dataset: Dataset, wheels: np.ndarray, poses: np.ndarray) -> 
 
 def with_counts_mended(dataset: Dataset) -> Dataset:
     """The Dataset without `wrong_counts`, and wheels mended that are exchanged or reversed."""
-    return _with_wheels_mended(replace(dataset, ticks=dataset.ticks - wrong_counts(dataset)))
+    wrong = wrong_counts(dataset)
+    if wrong.any():                                      # of the same Dataset much is known
+        dataset = replace(dataset, ticks=dataset.ticks - wrong)
+    return _with_wheels_mended(dataset)
 
 
 @lru_cache(maxsize=2)
@@ -168,8 +171,8 @@ def wrong_counts(dataset: Dataset) -> np.ndarray:
     """What is wrong in counts (n, 2) of rows that have lost some, have them late, or twice.
 
     That is, a wheel has no counts in at most MAX_LOST rows, and many just before and after, or far
-    more in a few rows than around. As long as increments by markers agree better with what one of
-    the three would be without, the one that gains most is believed.
+    more in a few rows than around. All these rows are mended or none: as long as increments by
+    markers agree better without rows of one kind, the kind that gains most is mended.
     """
     markers, wheels, sigma, poses = moving_increments(dataset)
     ticks = dataset.ticks
@@ -183,7 +186,8 @@ def wrong_counts(dataset: Dataset) -> np.ndarray:
     least = cost(ticks)
     while True:
         found = {}
-        for kind in (_without_late, _without_lost, _without_peaks):
+        for kind in (partial(_without_gaps, all_late=True), partial(_without_gaps, all_late=False),
+                     _without_peaks):
             mended = np.stack([kind(counts) for counts in ticks.T], axis=1)
             if (mended != ticks).any():
                 found[cost(mended)] = mended
@@ -196,21 +200,12 @@ def wrong_counts(dataset: Dataset) -> np.ndarray:
         least = best
 
 
-def _without_late(counts):
-    """The counts (n,) of a wheel, if those after each gap are of all its rows."""
-    return _without_gaps(counts, lambda before, after, rows: True)
-
-
-def _without_lost(counts):
-    """The counts (n,) of a wheel, if those after a gap are of all its rows where this is nearer."""
-    return _without_gaps(counts, lambda before, after, rows: 2 * after > (1 + rows) * before)
-
-
-def _without_gaps(counts, is_late):
+def _without_gaps(counts, all_late):
     """The counts (n,) of a wheel that never stands still for a few rows only.
 
-    Where `is_late`, by counts before and after a gap and its `rows` with that after it, these share
-    the counts after it. Else the rows of the gap get what is usual before and after.
+    If they came late, its rows share the counts after a gap: always if `all_late`, else where these
+    are nearer to those of all the rows than to those of one. Where they do not, the rows of the gap
+    get what is usual before and after.
     """
     mended = counts.copy()
     moved = np.flatnonzero(counts)
@@ -221,7 +216,7 @@ def _without_gaps(counts, is_late):
         last = moved[k + 1]
         before = mended[first - 1]                       # shared if it is behind another gap
         after = counts[last]
-        if is_late(abs(before), abs(after), rows[k]):
+        if all_late or 2 * abs(after) > (1 + rows[k]) * abs(before):
             edges = np.rint(np.linspace(0, after, rows[k] + 1))
             mended[first:last + 1] = np.diff(edges)
         else:
