@@ -51,6 +51,7 @@ from slamlib.robust.jumps import (
     Jumps,
     cauchy_cost,
     find_jumps,
+    most_together,
     with_overlooked,
 )
 from slamlib.robust.linear import (
@@ -82,7 +83,6 @@ MAX_COST = 1.5               # ratio of sigmas of the last position, by what is 
 MIN_SPARED_SLIP = 4.0        # ratio of the slips without and with jumps that are believed
 MIN_JUMP_LEAD = 10.0         # log evidence by which a jump found at the solution is believed
 MIN_REJECTED = 3             # number of sightings together, near which a jump may be overlooked
-REJECTED_FRAMES = 10         # number of successive frames in which these are
 
 SMALL_SLIP = 2e-3            # sqrt(m), above which slow errors of sensors may be the cause
 LARGE_SLIP = 0.01            # sqrt(m), above which errors of sensors mostly are
@@ -613,7 +613,7 @@ def _overlooked(fit):
     m = fit.problem.measurements
     rejected = fit.problem.accepted.sightings.weight == 0
     by_frame = np.bincount(m.sightings.row[rejected], minlength=len(m.frame))
-    are_together = np.convolve(by_frame, np.ones(REJECTED_FRAMES)).max() >= MIN_REJECTED
+    are_together = most_together(by_frame) >= MIN_REJECTED
     if not are_together or not m.learned[0] or m.jumps.groups:
         return []
     return with_overlooked(m.dataset, m.jumps, fit.problem.noise.slip)

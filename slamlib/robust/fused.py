@@ -54,6 +54,7 @@ from slamlib.robust.jumps import (
     crawls,
     creep_covariance,
     find_jumps,
+    most_together,
     with_overlooked,
 )
 from slamlib.robust.part_faults import camera_bump, constant_delay, with_counts_mended
@@ -68,7 +69,6 @@ MAX_ENTRIES = 5e7            # of the covariances of all filters that run side b
 PRICE = 6.0                  # log density by which errors have memory, and by which the camera errs
 MIN_JUMP_GAIN = 10.0         # log likelihood by each of many jumps; the loss by each of a few
 MIN_REJECTED = 2             # number of sightings together, near which more jumps are sought
-REJECTED_FRAMES = 10         # number of successive frames in which these are
 # Rows of covariances; those of the markers follow
 POSE = slice(0, 3)
 WHEELS = slice(3, 6)
@@ -210,7 +210,7 @@ def _with_more_jumps(dataset, jumps, models):
     """
     states = _filter(dataset, jumps, models)
     rejected = np.diff([state.rejected for state in states], prepend=0)
-    are_together = np.convolve(rejected, np.ones(REJECTED_FRAMES)).max() >= MIN_REJECTED
+    are_together = most_together(rejected) >= MIN_REJECTED
     if not are_together or camera_bump(dataset) is not None:
         return jumps, states
     best = states[-1].likeliest

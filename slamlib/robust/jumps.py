@@ -59,6 +59,7 @@ CANCELLED = 0.3              # ratio of the size of all jumps together to that o
 MIN_COST_RATIO = 1.5         # without jumps and with them, of markers seen before and after
 MAX_UNSUPPORTED = 2          # number of jumps; sensors that have more of them may be poor
 UNKNOWN_SIGMA = np.array([10.0, 10.0, np.pi])  # m, m, rad, if no marker tells
+TOGETHER = 10                # number of successive frames, in which sightings are rejected together
 SLIPPING_CHANCE = 1e6        # of a jump in a row in which wheels slip, relative to others
 
 
@@ -239,6 +240,14 @@ def _sightings_by_marker(dataset):
     s = sightings_by_frame(dataset.sightings)
     order = np.lexsort((s.row, s.marker))
     return replace(s, row=s.row[order], marker=s.marker[order], z=s.z[order], C=s.C[order])
+
+
+def most_together(rejected: np.ndarray) -> int:
+    """Largest number of sightings in TOGETHER successive frames, by that `rejected` in each (f,).
+
+    Jumps that are overlooked show so; wrong labels rarely do.
+    """
+    return int(np.convolve(rejected, np.ones(TOGETHER)).max())
 
 
 def with_overlooked(dataset: Dataset, jumps: Jumps, slip: float) -> list[Jumps]:

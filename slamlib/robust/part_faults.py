@@ -171,8 +171,8 @@ def wrong_counts(dataset: Dataset) -> np.ndarray:
     """What is wrong in counts (n, 2) of rows that have lost some, have them late, or twice.
 
     That is, a wheel has no counts in at most MAX_LOST rows, and many just before and after, or far
-    more in a few rows than around. All these rows are mended or none: as long as increments by
-    markers agree better without rows of one kind, the kind that gains most is mended.
+    more in a few rows than around. Each kind is mended in all its rows or in none: the one by which
+    increments by markers agree best, again and again, as long as one gains enough.
     """
     markers, wheels, sigma, poses = moving_increments(dataset)
     ticks = dataset.ticks
@@ -203,14 +203,16 @@ def wrong_counts(dataset: Dataset) -> np.ndarray:
 def _without_gaps(counts, all_late):
     """The counts (n,) of a wheel that never stands still for a few rows only.
 
-    If they came late, its rows share the counts after a gap: always if `all_late`, else where these
-    are nearer to those of all the rows than to those of one. Where they do not, the rows of the gap
-    get what is usual before and after.
+    A gap are rows without counts. If `all_late`, it and the row behind it share the counts of that
+    row. Else they do only where these are nearer to the counts of so many rows than to those of
+    one, and any other gap gets the mean of the counts before and after it.
     """
     mended = counts.copy()
     moved = np.flatnonzero(counts)
     rows = np.diff(moved)
-    is_gap = (rows > 1) & (rows <= MAX_LOST + 1) & _go_on(counts[moved[:-1]], counts[moved[1:]])
+    is_fast = _is_fast(counts[moved])
+    goes_on = is_fast[:-1] & is_fast[1:] & (np.diff(np.sign(counts[moved])) == 0)
+    is_gap = goes_on & (rows > 1) & (rows <= MAX_LOST + 1)
     for k in np.flatnonzero(is_gap):
         first = moved[k] + 1
         last = moved[k + 1]
@@ -228,15 +230,15 @@ def _without_peaks(counts):
     """The counts (n,) of a wheel, if it never turns far more in a row than in most around it."""
     around = sliding_window_view(np.pad(counts, AROUND, mode="edge"), 2 * AROUND + 1)
     usual = np.rint(np.median(around, axis=1)).astype(counts.dtype)
-    is_peak = (np.abs(counts) > PEAK * np.abs(usual)) & _go_on(usual, usual)
+    is_peak = (np.abs(counts) > PEAK * np.abs(usual)) & _is_fast(usual)
     return np.where(is_peak, usual, counts)
 
 
-def _go_on(before, after):
-    """Whether a wheel moves with counts `before` (m,) and `after`, as it mostly does."""
-    speed = np.minimum(np.abs(before), np.abs(after))
-    least = SLOW * np.median(np.abs(before)) if len(before) else 0.0
-    return (speed >= max(MIN_SPEED, least)) & (np.sign(before) == np.sign(after))
+def _is_fast(counts):
+    """Where counts (n,) of a wheel are so large that it does not stop from one row to the next."""
+    speed = np.abs(counts)
+    usual = np.median(speed) if len(speed) else 0.0
+    return speed >= max(MIN_SPEED, SLOW * usual)
 
 
 def _with_wheels_mended(dataset):
