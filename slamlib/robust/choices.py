@@ -38,12 +38,15 @@ from slamlib.robust.calibration import RADII, WHEEL_SCALE, WHEELS, Prior
 from slamlib.robust.error_memory import runs
 from slamlib.robust.factors import odometry_error, preintegrate_odometry
 from slamlib.robust.fit import (
+    CAUCHY_SCALES,
     ROUGH,
     Fit,
     accepted_measurements,
     has_memory,
+    narrow_kernels,
     refine,
     refine_without_memory,
+    relinearized,
     residuals,
 )
 from slamlib.robust.jumps import (
@@ -539,13 +542,13 @@ def most_consistent(
                     return with_places, places
     for jumps in _overlooked(fit):
         count = len(jumps.start) - len(fit.problem.measurements.jumps.start)
-        other = _alternative(start, fit, jumps)
+        other = _with_more_jumps(fit, jumps)
         is_needed = spares_sightings(other, fit, "more jumps", MIN_SPARED * count)
         if is_needed and other.problem.noise.slip <= fit.problem.noise.slip:
             fit = decide(start(jumps))
             break
     jumps = with_stretched(fit)
-    if jumps is not None and _lead_of_jumps(_alternative(start, fit, jumps), fit) > MIN_JUMP_LEAD:
+    if jumps is not None and _lead_of_jumps(_with_more_jumps(fit, jumps), fit) > MIN_JUMP_LEAD:
         return decide(start(jumps)), None
     return fit, None
 
@@ -556,6 +559,18 @@ def _alternative(start, fit, jumps, places=None):
         return start(jumps, places, fit)
     except (DatasetError, np.linalg.LinAlgError):
         return None
+
+
+def _with_more_jumps(fit, jumps):
+    """The Fit with more Jumps, from the solution and decisions of a Fit, or None."""
+    more = replace(fit.problem.measurements, jumps=jumps)
+    problem = relinearized(replace(fit.problem, measurements=more), fit.state)
+    try:
+        state = narrow_kernels(problem, fit.state, CAUCHY_SCALES[-1:])
+        found = refine(problem, state)
+    except (DatasetError, np.linalg.LinAlgError):
+        return None
+    return replace(found, explanations=fit.explanations, lead=fit.lead)
 
 
 def _with_jumps(dataset, start, decide, bump):

@@ -236,7 +236,7 @@ def _settled_fit(problem, state, accept):
     accepted = accept(problem, state)
     is_settled = False
     for number in range(1, MAX_ROUNDS + 1):
-        problem = _relinearized(replace(problem, accepted=accepted), state)
+        problem = relinearized(replace(problem, accepted=accepted), state)
         if m.learned.any() and not is_settled:
             problem, state, posterior = _settle_noise(problem, state)
         problem = _with_least_slip(problem)
@@ -271,7 +271,7 @@ def _fit(problem, optimum, posterior):
                converged=optimum.converged and is_linear)
 
 
-def _relinearized(problem, state):
+def relinearized(problem: Problem, state: State) -> Problem:
     """The Problem at the wheels and delays of a State."""
     odometry = preintegrate_odometry(
         problem.measurements, problem.odometry.model, state.c[WHEELS], problem.noise.slip)
@@ -313,7 +313,7 @@ def settled(fit: Fit) -> Fit:
         is_linear = _is_linear(problem, state, SETTLED_MOVE)
         if is_linear:
             break
-        problem = _relinearized(problem, state)
+        problem = relinearized(problem, state)
     return replace(fit, problem=problem, state=state, converged=optimum.converged and is_linear)
 
 
