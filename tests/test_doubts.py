@@ -168,10 +168,12 @@ def late(ticks, rng):
     return ticks
 
 
-def every_third(ticks, _):
-    """An encoder that is read every third row only."""
-    total = np.cumsum(ticks, axis=0)[np.arange(len(ticks)) // 3 * 3]
-    return np.diff(total, axis=0, prepend=total[:1])
+def read_every(rows):
+    """An encoder that is read only every so many rows; images are taken every fifth."""
+    def spoil(ticks, _):
+        total = np.cumsum(ticks, axis=0)[np.arange(len(ticks)) // rows * rows]
+        return np.diff(total, axis=0, prepend=total[:1])
+    return spoil
 
 
 def doubled(ticks, rng):
@@ -185,7 +187,8 @@ def spikes(ticks, _):
     return ticks
 
 
-@pytest.mark.parametrize("spoil", [lost, late, every_third, doubled, spikes])
+@pytest.mark.parametrize("spoil", [
+    lost, late, read_every(3), read_every(5), doubled, spikes])
 def test_counts_of_single_rows_that_are_wrong_are_told_and_mended(spoil):
     """Problem 3 was 8 to 130 mm off, 3 are usual; where it was less than 30, NEES was 10 to 970."""
     clean, truth = drive(3)
@@ -204,6 +207,9 @@ def test_counts_of_single_rows_are_mended_by_those_around_them():
     assert_array_equal(part_faults._without_gaps(counts, all_late=False), mended)
     late = [90, 100, 35, 36, 35, 100, 100, 100, 100, 100, 100]
     assert_array_equal(part_faults._without_gaps(-counts, all_late=True), -np.array(late))
+    rarely = np.array([0, 0, 0, 300, 0, 0, 330])
+    in_time = [0, 100, 100, 100, 110, 110, 110]
+    assert_array_equal(part_faults._without_gaps(rarely, all_late=True), in_time)
     stops = np.array([100, 50, 4, 0, 0, 3, 50, 100, 0, -100, 0] + 21 * [0] + [100])
     assert_array_equal(part_faults._without_gaps(stops, all_late=False), stops)
     twice = np.array([90, 92, 188, 192, 98, -300, 102, 104, 104])

@@ -256,8 +256,9 @@ def single_rows(dataset: Dataset) -> Iterator[Doubt]:
     if len(rows):
         yield Doubt("encoder-rows", (
             f"In {len(rows)} of {len(wrong)} rows of encoderReading.txt, the first at pose "
-            f"{rows[0] + 1}, counts are lost, late or doubled: by the markers the wheels go on as "
-            "in the rows around. Problem 2's fusion and problems 3 and 4 assume so."),
+            f"{rows[0] + 1}, counts are lost, late or doubled, by the rows around or by the "
+            "markers. Problem 2's fusion and problems 3 and 4 assume that the wheels go on as in "
+            "the rows around."),
             "Look at how the counts were read.")
 
 

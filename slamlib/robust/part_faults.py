@@ -52,8 +52,9 @@ MIN_MOTION_SIGMAS = 5.0   # sigmas by markers of distance or turn, from which on
 AGREEMENT_RATIO = 0.1     # of an increment
 AGREEMENT_SIGMAS = 3.0    # sigmas of the increment by markers
 MIN_AGREEING_SHARE = 0.7  # of the increments with an accepted A
-MAX_LOST = 20             # rows in which a wheel that moves has no counts
+MAX_GAP = 20              # rows in which a wheel that moves has no counts
 MIN_SPEED = 5             # counts in a row, of a wheel that moves
+MOSTLY = 0.5              # of the rows in which a wheel moves, that have counts late
 SLOW = 0.5                # of the median speed, below which a wheel may stop
 AROUND = 5                # rows before and after
 PEAK = 1.5                # ratio of counts in a row to those in most rows around it
@@ -170,14 +171,22 @@ def with_counts_mended(dataset: Dataset) -> Dataset:
 def wrong_counts(dataset: Dataset) -> np.ndarray:
     """What is wrong in counts (n, 2) of rows that have lost some, have them late, or twice.
 
-    That is, a wheel has no counts in at most MAX_LOST rows, and many just before and after, or far
+    That is, a wheel has no counts in at most MAX_GAP rows, and many just before and after, or far
     more in a few rows than around. Each kind is mended in all its rows or in none: the one by which
-    increments by markers agree best, again and again, as long as one gains enough.
+    increments by markers agree best, again and again, as long as one gains enough. Counts that are
+    late in most rows, as of encoders that are read less often than they are logged, are so even
+    where no marker tells.
     """
     markers, wheels, sigma, poses = moving_increments(dataset)
     ticks = dataset.ticks
+    in_time = _mended(ticks, partial(_without_gaps, all_late=True))
+    is_moving = in_time.any(axis=1)
+    is_late = (in_time != ticks).any(axis=1)
+    if is_late.sum() > MOSTLY * is_moving.sum():
+        log.info("wheels: counts late in most rows, mended")
+        ticks = in_time
     if len(wheels) < MIN_COUNT:
-        return np.zeros_like(ticks)
+        return dataset.ticks - ticks
 
     def cost(ticks):
         by_wheels = _increments(_path(replace(dataset, ticks=ticks)), poses)
@@ -188,7 +197,7 @@ def wrong_counts(dataset: Dataset) -> np.ndarray:
         found = {}
         for kind in (partial(_without_gaps, all_late=True), partial(_without_gaps, all_late=False),
                      _without_peaks):
-            mended = np.stack([kind(counts) for counts in ticks.T], axis=1)
+            mended = _mended(ticks, kind)
             if (mended != ticks).any():
                 found[cost(mended)] = mended
         best = min(found, default=np.inf)
@@ -200,19 +209,27 @@ def wrong_counts(dataset: Dataset) -> np.ndarray:
         least = best
 
 
+def _mended(ticks, kind):
+    """The counts (n, 2) with those of each wheel mended by a function `kind`."""
+    return np.stack([kind(counts) for counts in ticks.T], axis=1)
+
+
 def _without_gaps(counts, all_late):
     """The counts (n,) of a wheel that never stands still for a few rows only.
 
     A gap are rows without counts. If `all_late`, it and the row behind it share the counts of that
-    row. Else they do only where these are nearer to the counts of so many rows than to those of
-    one, and any other gap gets the mean of the counts before and after it.
+    row, and the drive begins as if the wheel were turning. Else they share them only where these
+    are nearer to the counts of so many rows than to those of one, and any other gap gets the mean
+    of the counts before and after it.
     """
     mended = counts.copy()
-    moved = np.flatnonzero(counts)
+    if all_late and counts.any():
+        mended[0] = counts[counts != 0][0]
+    moved = np.flatnonzero(mended)
     rows = np.diff(moved)
-    is_fast = _is_fast(counts[moved])
-    goes_on = is_fast[:-1] & is_fast[1:] & (np.diff(np.sign(counts[moved])) == 0)
-    is_gap = goes_on & (rows > 1) & (rows <= MAX_LOST + 1)
+    is_fast = _is_fast(mended[moved])
+    goes_on = is_fast[:-1] & is_fast[1:] & (np.diff(np.sign(mended[moved])) == 0)
+    is_gap = goes_on & (rows > 1) & (rows <= MAX_GAP + 1)
     for k in np.flatnonzero(is_gap):
         first = moved[k] + 1
         last = moved[k + 1]
@@ -223,6 +240,7 @@ def _without_gaps(counts, all_late):
             mended[first:last + 1] = np.diff(edges)
         else:
             mended[first:last] = np.rint((before + after) / 2)
+    mended[0] = counts[0]
     return mended
 
 
