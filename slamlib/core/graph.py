@@ -73,8 +73,9 @@ def count_everything(dataset: Dataset, kernel: str = "Cauchy", slip: float = TYP
 
     `kernel` is a name in `kernels.KERNELS`, of sightings and ranges, `slip` is in sqrt(m), and
     `extra` are further encoder poses that are variables. Camera, size of the markers, offset and
-    scale of the ranges are as stated; delays and the height of the antennas are ignored, and the
-    tag is at the vehicle's origin. Raises DatasetError for another kernel, slip or pose.
+    scale of the ranges are as stated, and the delay of the sightings to whole steps; the delay of
+    the ranges and the height of the antennas are ignored, and the tag is at the vehicle's origin.
+    Raises DatasetError for another kernel, slip or pose.
     """
     known = ", ".join(KERNELS)
     require(kernel in KERNELS, "count_everything", f"one of {known} for kernel", kernel)

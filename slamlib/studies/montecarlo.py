@@ -22,7 +22,7 @@ from slamlib import (
 from slamlib.core import odometry, se2
 from slamlib.core.evaluation import anees, ate, position_sigmas
 from slamlib.core.records import Dataset, Truth
-from slamlib.robust.fit import refine
+from slamlib.robust.fit import refine_without_memory, settled
 from slamlib.robust.result import SlamResult, slam_result
 from slamlib.robust.solution_doubts import solution_doubts
 from slamlib.studies.simulation import simulate
@@ -140,10 +140,8 @@ def correlated_errors(seed: int, correlation: float, **options) -> dict:
 
 
 def _counted_in_full(fit):
-    """The SlamResult with the noise of a Fit, where every sighting keeps all its information."""
-    accepted = fit.problem.accepted
-    in_full = accepted.with_shares(np.ones_like(each.share) for each in accepted)
-    return slam_result(refine(replace(fit.problem, accepted=in_full), fit.state, accept=None))
+    """The SlamResult from a Fit, with noise as of sightings that keep all their information."""
+    return slam_result(settled(refine_without_memory(fit.problem, fit.state)))
 
 
 def antenna_error(found, truth: Truth) -> tuple[np.ndarray, np.ndarray]:
