@@ -207,15 +207,23 @@ def test_counts_of_single_rows_are_mended_by_those_around_them():
     assert_array_equal(part_faults._without_gaps(counts, all_late=False), mended)
     late = [90, 100, 35, 36, 35, 100, 100, 100, 100, 100, 100]
     assert_array_equal(part_faults._without_gaps(-counts, all_late=True), -np.array(late))
-    rarely = np.array([0, 0, 0, 300, 0, 0, 330])
-    in_time = [0, 100, 100, 100, 110, 110, 110]
-    assert_array_equal(part_faults._without_gaps(rarely, all_late=True), in_time)
     stops = np.array([100, 50, 4, 0, 0, 3, 50, 100, 0, -100, 0] + 21 * [0] + [100])
     assert_array_equal(part_faults._without_gaps(stops, all_late=False), stops)
     twice = np.array([90, 92, 188, 192, 98, -300, 102, 104, 104])
     mended = [90, 92, 92, 98, 98, 104, 102, 104, 104]
     assert_array_equal(part_faults._without_peaks(twice), mended)
     assert_array_equal(part_faults._without_peaks(-twice), -np.array(mended))
+
+
+def test_counts_of_an_encoder_that_is_read_rarely_are_spread_over_the_rows_since_it_was_read():
+    """First of fewer rows; one is lost, the wheel stands, turns back; the last rows are unread."""
+    often = 20 * [0, 0, 120]
+    counts = [7, 0, 80, *often, 0, 0, 0, 0, 0, 90, *(10 * [0]), -60, 0, 0, -66, 0, 0]
+    in_time = [7, 40, 40, *(60 * [40]), 0, 0, 0, 30, 30, 30, *(8 * [0]), -20, -20, -20]
+    in_time += 5 * [-22]
+    assert_allclose(part_faults._read_rarely(np.array(counts)), in_time, atol=1e-9)
+    for other in (20 * [0] + [40, 42], [40, 0, 42, 0, 0, 40, 41], [0, 1, 0, 2, 0, 1], [0], [5, 0]):
+        assert_array_equal(part_faults._read_rarely(np.array(other)), other)
 
 
 def test_a_vehicle_that_stops_for_one_row_by_the_markers_has_lost_no_counts():

@@ -256,10 +256,10 @@ def single_rows(dataset: Dataset) -> Iterator[Doubt]:
     if len(rows):
         yield Doubt("encoder-rows", (
             f"In {len(rows)} of {len(wrong)} rows of encoderReading.txt, the first at pose "
-            f"{rows[0] + 1}, counts are lost, late or doubled, by the rows around or by the "
-            "markers. Problem 2's fusion and problems 3 and 4 assume that the wheels go on as in "
-            "the rows around."),
-            "Look at how the counts were read.")
+            f"{rows[0] + 1}, counts are lost, late or doubled, as far as the rows around or "
+            "the markers tell. Problem 2's fusion and problems 3 and 4 assume that the wheels go "
+            "on as in the rows around."),
+            "Look at how the counts were read, and whether the vehicle stops for single rows.")
 
 
 def common_divisor(ticks: np.ndarray) -> int:

@@ -54,7 +54,8 @@ AGREEMENT_SIGMAS = 3.0    # sigmas of the increment by markers
 MIN_AGREEING_SHARE = 0.7  # of the increments with an accepted A
 MAX_GAP = 20              # rows in which a wheel that moves has no counts
 MIN_SPEED = 5             # counts in a row, of a wheel that moves
-MOSTLY = 0.5              # of the rows in which a wheel moves, that have counts late
+MOSTLY = 0.6              # of the rows with counts that are behind rows without any
+USUAL = 0.9               # probability of the quantile of the pauses between these rows
 SLOW = 0.5                # of the median speed, below which a wheel may stop
 AROUND = 5                # rows before and after
 PEAK = 1.5                # ratio of counts in a row to those in most rows around it
@@ -171,27 +172,32 @@ def with_counts_mended(dataset: Dataset) -> Dataset:
 def wrong_counts(dataset: Dataset) -> np.ndarray:
     """What is wrong in counts (n, 2) of rows that have lost some, have them late, or twice.
 
-    That is, a wheel has no counts in at most MAX_GAP rows, and many just before and after, or far
-    more in a few rows than around. Each kind is mended in all its rows or in none: the one by which
-    increments by markers agree best, again and again, as long as one gains enough. Counts that are
-    late in most rows, as of encoders that are read less often than they are logged, are so even
-    where no marker tells.
+    First, encoders may be read less often than they are logged, unless the markers, late or not,
+    contradict it. Then a wheel may have no counts in at most MAX_GAP rows, and many just before and
+    after, or far more in a few rows than around. Each kind is mended in all its rows or in none:
+    the one by which increments by markers agree best, again and again, as long as one gains enough.
     """
     markers, wheels, sigma, poses = moving_increments(dataset)
     ticks = dataset.ticks
-    in_time = _mended(ticks, partial(_without_gaps, all_late=True))
-    is_moving = in_time.any(axis=1)
-    is_late = (in_time != ticks).any(axis=1)
-    if is_late.sum() > MOSTLY * is_moving.sum():
-        log.info("wheels: counts late in most rows, mended")
-        ticks = in_time
-    if len(wheels) < MIN_COUNT:
+    are_few = len(wheels) < MIN_COUNT
+
+    def cost(ticks, delays=(0,)):
+        path = _path(replace(dataset, ticks=ticks))
+        late = [_increments(path, poses, steps) for steps in delays]
+        return min(_cost(markers, each, sigma, _by_camera(each)) for each in late)
+
+    def least_gain(cost):
+        """What the cost must change by, in the variance that it shows in x and y of each."""
+        return MIN_MENDED_GAIN * max(1.0, cost / (2 * len(wheels)))
+
+    read = _mended(ticks, _read_rarely)
+    if (read != ticks).any():
+        as_logged = np.inf if are_few else cost(ticks, DELAYS)
+        if are_few or cost(read, DELAYS) <= as_logged + least_gain(as_logged):
+            log.info("wheels: encoders are read less often than they are logged")
+            ticks = read
+    if are_few:
         return dataset.ticks - ticks
-
-    def cost(ticks):
-        by_wheels = _increments(_path(replace(dataset, ticks=ticks)), poses)
-        return _cost(markers, by_wheels, sigma, _by_camera(by_wheels))
-
     least = cost(ticks)
     while True:
         found = {}
@@ -201,8 +207,7 @@ def wrong_counts(dataset: Dataset) -> np.ndarray:
             if (mended != ticks).any():
                 found[cost(mended)] = mended
         best = min(found, default=np.inf)
-        scale = max(1.0, best / (2 * len(wheels)))       # x and y of each
-        if not least - best > MIN_MENDED_GAIN * scale:
+        if not least - best > least_gain(best):
             return dataset.ticks - ticks
         log.info("wheels: counts of single rows mended, cost %.1f, before %.1f", best, least)
         ticks = found[best]
@@ -214,21 +219,44 @@ def _mended(ticks, kind):
     return np.stack([kind(counts) for counts in ticks.T], axis=1)
 
 
+def _read_rarely(counts):
+    """The counts (n,) of a wheel, evenly over the rows since its encoder was read before.
+
+    It is read rarely if most of its counts are behind rows without any. A wheel that has none for
+    longer than usual stands still, but in the last rows it goes on if they are fewer.
+    """
+    rows = np.arange(len(counts))
+    read = rows[1:][counts[1:] != 0]
+    pauses = np.diff(read)
+    is_rare = np.mean(pauses > 1) > MOSTLY if len(pauses) else False
+    if not is_rare or np.median(np.abs(counts[read])) < MIN_SPEED:
+        return counts
+    usual = np.quantile(pauses, USUAL)
+    since = np.maximum(read - usual, np.append(0, read[:-1]))
+    after = np.cumsum(counts[read])
+    before = np.append(0, after[:-1])
+    knots = np.stack([since, read], axis=1).ravel()
+    at_knots = np.stack([before, after], axis=1).ravel()
+    total = np.interp(rows, knots, at_knots)
+    in_time = np.diff(total, prepend=0)
+    if len(counts) - read[-1] <= usual:
+        in_time[read[-1] + 1:] = in_time[read[-1]]
+    in_time[0] = counts[0]
+    return in_time
+
+
 def _without_gaps(counts, all_late):
     """The counts (n,) of a wheel that never stands still for a few rows only.
 
     A gap are rows without counts. If `all_late`, it and the row behind it share the counts of that
-    row, and the drive begins as if the wheel were turning. Else they share them only where these
-    are nearer to the counts of so many rows than to those of one, and any other gap gets the mean
-    of the counts before and after it.
+    row. Else they do only where these are nearer to the counts of so many rows than to those of
+    one, and any other gap gets the mean of the counts before and after it.
     """
     mended = counts.copy()
-    if all_late and counts.any():
-        mended[0] = counts[counts != 0][0]
-    moved = np.flatnonzero(mended)
+    moved = np.flatnonzero(counts)
     rows = np.diff(moved)
-    is_fast = _is_fast(mended[moved])
-    goes_on = is_fast[:-1] & is_fast[1:] & (np.diff(np.sign(mended[moved])) == 0)
+    is_fast = _is_fast(counts[moved])
+    goes_on = is_fast[:-1] & is_fast[1:] & (np.diff(np.sign(counts[moved])) == 0)
     is_gap = goes_on & (rows > 1) & (rows <= MAX_GAP + 1)
     for k in np.flatnonzero(is_gap):
         first = moved[k] + 1
@@ -240,7 +268,6 @@ def _without_gaps(counts, all_late):
             mended[first:last + 1] = np.diff(edges)
         else:
             mended[first:last] = np.rint((before + after) / 2)
-    mended[0] = counts[0]
     return mended
 
 
