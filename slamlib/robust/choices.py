@@ -11,8 +11,8 @@ wide sigmas. For a prior of precisions P on the entries that are not known, the 
 
 so that one linearisation ranks all sets of groups (score tests: Rao, Proc. Camb. Phil. Soc. 44(1),
 1948). A group that leads decisively is told. One that leads less is released, too, so that the
-covariances include it, if its evidence still leads on the same measurements and weights, and the
-last position stays nearly as certain.
+covariances include it, if its evidence still leads on the same measurements and weights, the last
+position stays nearly as certain, and no entry is far from what is stated.
 
 A visit is a run of sightings of an id without a long break. Where a solution rejects most sightings
 of a visit, the drive is solved once more with a landmark for every visit, so that only the path
@@ -83,6 +83,7 @@ GROSS = 10.0                 # factor on the wide sigmas beyond MAX_WIDE_SIGMAS
 MIN_INFORMATION = 1e-3       # about an entry, in wide sigmas, below which it is not considered
 MAX_PROPOSALS = 5            # number of sets that are solved
 MAX_COST = 1.5               # ratio of sigmas of the last position, by what is released untold
+MAX_UNTOLD = 1.0             # wide sigmas, by which what is released untold may be off
 MIN_SPARED_SLIP = 4.0        # ratio of the slips without and with jumps that are believed
 MIN_JUMP_LEAD = 10.0         # log evidence by which a jump found at the solution is believed
 MIN_REJECTED = 3             # number of sightings together, near which a jump may be overlooked
@@ -296,7 +297,7 @@ class _Sets(NamedTuple):
     evidence: np.ndarray         # (s,) log evidence, -inf where what is released cannot be
     merit: np.ndarray            # (s,) log evidence less the prices of the groups
     surprise: np.ndarray         # (s,) part of the prices, of groups that are stated in full
-    furthest: np.ndarray         # (s,) largest posterior mean of what is released, in its sigmas
+    moved: np.ndarray            # (s, p) size of the means of what is released, in its sigmas, or 0
     variance: np.ndarray         # (s,) m^2, of the last position
 
 
@@ -306,8 +307,9 @@ def _proposal(fit):
     `explanations` are the best set of groups and others that the drive cannot tell from it, neither
     part of it nor more. The prior releases all groups that are likely, and what else raises the
     evidence: not certain enough to be told, but the covariances include it, unless the last
-    position would be far less certain. Wide standard deviations are multiplied by GROSS if an entry
-    that is released would be further off than MAX_WIDE_SIGMAS.
+    position would be far less certain, or it is far from what is stated. Wide standard
+    deviations are multiplied by GROSS if an entry that is released would be further off than
+    MAX_WIDE_SIGMAS.
     """
     calibration = fit.problem.measurements.calibration
     likelihood = _likelihood(fit)
@@ -315,11 +317,11 @@ def _proposal(fit):
         sets = _sets(calibration, likelihood, width)
         k = int(sets.merit.argmax())
         best = sets.groups[k]
-        if not best or sets.furthest[k] < MAX_WIDE_SIGMAS:
+        if not best or sets.moved[k].max() < MAX_WIDE_SIGMAS:
             break
     likely, told = _as_likely(sets, k)
     explanations = tuple(some for some in told if not (some < best or some > best))
-    k = _released_set(sets, certain=frozenset().union(*likely), default=k)
+    k = _released_set(calibration, sets, certain=frozenset().union(*likely), default=k)
     root = _in_wide_sigmas(calibration, likelihood.L, fit.problem.prior.root)
     present = _posterior(likelihood, root)[0]
     return _Proposal(explanations, sets.priors[k], sets.evidence[k] - present)
@@ -362,8 +364,7 @@ def _sets(calibration, likelihood, width):
     prices = np.array([sum(price[group] for group in some) for some in sets])
     surprises = np.array([sum(surprise[group] for group in some) for some in sets])
     return _Sets(sets, priors, evidence, evidence - prices, surprises,
-                 furthest=np.max(np.abs(mean), axis=1, where=is_released, initial=0.0),
-                 variance=variance)
+                 moved=np.where(is_released, np.abs(mean), 0.0), variance=variance)
 
 
 def _as_likely(sets, best):
@@ -397,17 +398,21 @@ def _in_wide_sigmas(calibration, L, roots):
     return (np.diag(L) > 0)[:, None] / calibration.wide[:, None] * roots
 
 
-def _released_set(sets, certain, default):
+def _released_set(calibration, sets, certain, default):
     """Number of the most probable of the _Sets that hold `certain`, the `default` if none does.
 
     With what it releases beside them the sigma of the last position is at most MAX_COST times as
-    large.
+    large. That moves by at most MAX_UNTOLD: small errors are common, large ones must be certain.
     """
     holding = [k for k, some in enumerate(sets.groups) if certain <= some]
     if not holding:
         return default
     largest = MAX_COST**2 * sets.variance[holding].min()
-    affordable = [k for k in holding if sets.variance[k] <= largest]
+    untold = sets.moved.copy()
+    for group in certain:
+        untold[:, calibration.of_group(group)] = 0.0
+    furthest = untold.max(axis=1)
+    affordable = [k for k in holding if sets.variance[k] <= largest and furthest[k] <= MAX_UNTOLD]
     probable = sets.evidence - sets.surprise
     return max(affordable, key=probable.item)
 
