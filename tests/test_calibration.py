@@ -287,37 +287,17 @@ def test_wheels_that_drift_and_markers_are_as_likely_although_the_wheels_are_sta
     assert mean_nees(found, truth) < 8
 
 
-def test_what_is_not_told_is_near_what_was_stated():
-    """Evidence of 5 is too little to tell; the size may be off by a part of its wide sigma only."""
-    stated = calibration.stated_calibration(Vehicle(), ())
-    size = np.flatnonzero(stated.of_group("marker-size"))
-    for wide_sigmas, certain, number in ((0.8, "", 1), (2.0, "", 0), (2.0, "marker-size", 1)):
-        moved = np.zeros((2, len(stated.stated)))
-        moved[1, size] = wide_sigmas
-        sets = choices._Sets(
-            groups=[frozenset(), frozenset({"marker-size"})], priors=[],
-            evidence=np.array([0.0, 5.0]),
-            merit=np.array([0.0, -1.0]), surprise=np.zeros(2), moved=moved, variance=np.ones(2))
-        assert choices._released_set(stated, sets, frozenset(certain.split()), default=0) == number
-
-
-def test_wheels_that_slip_slowly_have_no_other_wheelbase_untold():
-    """It was released with little evidence, 20 mm off: NEES was 75."""
-    dataset, truth = short(9, 2000)
-    rng = np.random.default_rng(9)
-    travel = np.pi / 40000 * np.abs(dataset.ticks).mean(axis=1)          # m in each row
-    slow = np.ones(dataset.ticks.shape)
-    error = rng.normal(0, 0.01, 2)
-    for row, metres in enumerate(travel):
-        left = np.exp(-metres / 8)
-        error = left * error + np.sqrt(1 - left**2) * rng.normal(0, 0.01, 2)
-        slow[row] += error
-    images = np.unique(dataset.aruco.pose)[::10]
-    found = estimate(replace(
-        dataset, uwb=None, ticks=np.rint(slow * dataset.ticks).astype(int),
-        aruco=dataset.aruco.select(np.isin(dataset.aruco.pose, images))))
-    assert not found.released
-    assert mean_nees(found, truth) < 20
+def test_what_is_far_from_what_was_stated_must_be_certain():
+    """A size that is off by more than its wide sigma, 5 %, costs its price; a nearer one nothing."""
+    for sigma, size, groups, price in ((0.0, 1.04, {"marker-size"}, 0.0), (0.0, 1.06, {}, 0.0),
+                                       (0.0, 0.94, {"marker-size", "time-offset"}, 6.0),
+                                       (0.01, 1.06, {"marker-size"}, 9.0)):
+        stated = calibration.stated_calibration(Vehicle(sigma_marker_size=sigma), ())
+        c = stated.stated.copy()
+        c[SIZE] = size
+        fit = SimpleNamespace(state=SimpleNamespace(c=c), problem=SimpleNamespace(
+            measurements=SimpleNamespace(calibration=stated)))
+        assert choices._price_of_far(fit, groups) == price
 
 
 def test_counts_that_were_cut_off_say_so_and_leave_the_metre_to_the_markers():

@@ -275,12 +275,24 @@ def _released(fit, proposal):
         log.info("calibration: %s released, no solution: refused", names)
         return None
     needed = 0.0 if proposal.lead >= 0 else proposal.lead - DECISIVE_RELEASE
+    needed += _price_of_far(proposed, proposal.prior.groups - fit.problem.prior.groups)
     is_kept = not lead < needed
     log.info("calibration: %s released, log evidence %+.1f (predicted %+.1f): %s", names, lead,
              proposal.lead, "kept" if is_kept else "refused")
     if not is_kept:
         return None
     return replace(proposed, explanations=proposal.explanations, lead=fit.lead + lead)
+
+
+def _price_of_far(fit, groups):
+    """The prices of those groups whose entries are far from what is stated: they must be certain.
+
+    Small errors of statements are common, large ones are not.
+    """
+    calibration = fit.problem.measurements.calibration
+    off = np.abs(fit.state.c - calibration.stated) > MAX_UNTOLD * calibration.wide
+    return sum(_price(calibration, group) for group in groups
+               if off[calibration.of_group(group)].any())
 
 
 def _is_solved(fit):
@@ -297,7 +309,7 @@ class _Sets(NamedTuple):
     evidence: np.ndarray         # (s,) log evidence, -inf where what is released cannot be
     merit: np.ndarray            # (s,) log evidence less the prices of the groups
     surprise: np.ndarray         # (s,) part of the prices, of groups that are stated in full
-    moved: np.ndarray            # (s, p) size of the means of what is released, in its sigmas, or 0
+    furthest: np.ndarray         # (s,) largest posterior mean of what is released, in its sigmas
     variance: np.ndarray         # (s,) m^2, of the last position
 
 
@@ -307,9 +319,8 @@ def _proposal(fit):
     `explanations` are the best set of groups and others that the drive cannot tell from it, neither
     part of it nor more. The prior releases all groups that are likely, and what else raises the
     evidence: not certain enough to be told, but the covariances include it, unless the last
-    position would be far less certain, or it is far from what is stated. Wide standard
-    deviations are multiplied by GROSS if an entry that is released would be further off than
-    MAX_WIDE_SIGMAS.
+    position would be far less certain. Wide standard deviations are multiplied by GROSS if an entry
+    that is released would be further off than MAX_WIDE_SIGMAS.
     """
     calibration = fit.problem.measurements.calibration
     likelihood = _likelihood(fit)
@@ -317,11 +328,11 @@ def _proposal(fit):
         sets = _sets(calibration, likelihood, width)
         k = int(sets.merit.argmax())
         best = sets.groups[k]
-        if not best or sets.moved[k].max() < MAX_WIDE_SIGMAS:
+        if not best or sets.furthest[k] < MAX_WIDE_SIGMAS:
             break
     likely, told = _as_likely(sets, k)
     explanations = tuple(some for some in told if not (some < best or some > best))
-    k = _released_set(calibration, sets, certain=frozenset().union(*likely), default=k)
+    k = _released_set(sets, certain=frozenset().union(*likely), default=k)
     root = _in_wide_sigmas(calibration, likelihood.L, fit.problem.prior.root)
     present = _posterior(likelihood, root)[0]
     return _Proposal(explanations, sets.priors[k], sets.evidence[k] - present)
@@ -364,7 +375,8 @@ def _sets(calibration, likelihood, width):
     prices = np.array([sum(price[group] for group in some) for some in sets])
     surprises = np.array([sum(surprise[group] for group in some) for some in sets])
     return _Sets(sets, priors, evidence, evidence - prices, surprises,
-                 moved=np.where(is_released, np.abs(mean), 0.0), variance=variance)
+                 furthest=np.max(np.abs(mean), axis=1, where=is_released, initial=0.0),
+                 variance=variance)
 
 
 def _as_likely(sets, best):
@@ -398,21 +410,17 @@ def _in_wide_sigmas(calibration, L, roots):
     return (np.diag(L) > 0)[:, None] / calibration.wide[:, None] * roots
 
 
-def _released_set(calibration, sets, certain, default):
+def _released_set(sets, certain, default):
     """Number of the most probable of the _Sets that hold `certain`, the `default` if none does.
 
     With what it releases beside them the sigma of the last position is at most MAX_COST times as
-    large. That moves by at most MAX_UNTOLD: small errors are common, large ones must be certain.
+    large.
     """
     holding = [k for k, some in enumerate(sets.groups) if certain <= some]
     if not holding:
         return default
     largest = MAX_COST**2 * sets.variance[holding].min()
-    untold = sets.moved.copy()
-    for group in certain:
-        untold[:, calibration.of_group(group)] = 0.0
-    furthest = untold.max(axis=1)
-    affordable = [k for k in holding if sets.variance[k] <= largest and furthest[k] <= MAX_UNTOLD]
+    affordable = [k for k in holding if sets.variance[k] <= largest]
     probable = sets.evidence - sets.surprise
     return max(affordable, key=probable.item)
 
