@@ -288,7 +288,7 @@ def test_wheels_that_drift_and_markers_are_as_likely_although_the_wheels_are_sta
 
 
 def test_what_is_far_from_what_was_stated_must_be_certain():
-    """A size that is off by more than its wide sigma, 5 %, costs its price; a nearer one nothing."""
+    """A size that is off by more than its wide sigma, 5 %, costs its price, a nearer one none."""
     for sigma, size, groups, price in ((0.0, 1.04, {"marker-size"}, 0.0), (0.0, 1.06, {}, 0.0),
                                        (0.0, 0.94, {"marker-size", "time-offset"}, 6.0),
                                        (0.01, 1.06, {"marker-size"}, 9.0)):
