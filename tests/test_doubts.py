@@ -215,6 +215,14 @@ def test_counts_of_single_rows_are_mended_by_those_around_them():
     assert_array_equal(part_faults._without_peaks(-twice), -np.array(mended))
 
 
+def test_encoders_that_are_read_at_different_paces_are_told_as_such_only():
+    """They were told as of another drive, too."""
+    dataset = drive(3)[0].without("uwb")
+    by_pace = [read_every(rows)(dataset.ticks, None) for rows in (2, 21)]
+    spoilt = replace(dataset, ticks=np.stack([by_pace[0][:, 0], by_pace[1][:, 1]], axis=1))
+    assert [doubt.what for doubt in doubts_before_solving(spoilt)] == ["encoder-rows"]
+
+
 def test_counts_of_an_encoder_that_is_read_rarely_are_spread_over_the_rows_since_it_was_read():
     """First of fewer rows; one is lost, the wheel stands, turns back; the last rows are unread."""
     often = 20 * [0, 0, 120]

@@ -26,6 +26,7 @@ from slamlib.robust.part_faults import (
     with_headings_reversed,
     with_other_axes,
     with_sightings_inverted,
+    without_wrong_counts,
     wrong_counts,
 )
 
@@ -96,6 +97,7 @@ def merged(doubts: Iterable[Doubt]) -> list[Doubt]:
 
 def motion_doubts(dataset: Dataset) -> list[Doubt]:
     """List of Doubts about dead wheels, else about axes, else about units or drives."""
+    dataset = without_wrong_counts(dataset)
     markers, wheels, sigma, poses = moving_increments(dataset)
     if len(wheels) < MIN_COUNT:
         return []

@@ -162,10 +162,15 @@ def with_other_axes(dataset: Dataset, wheels: np.ndarray, poses: np.ndarray) -> 
 
 def with_counts_mended(dataset: Dataset) -> Dataset:
     """The Dataset without `wrong_counts`, and wheels mended that are exchanged or reversed."""
+    return _with_wheels_mended(without_wrong_counts(dataset))
+
+
+def without_wrong_counts(dataset: Dataset) -> Dataset:
+    """The Dataset without `wrong_counts`, the same one if there are none."""
     wrong = wrong_counts(dataset)
-    if wrong.any():                                      # of the same Dataset much is known
-        dataset = replace(dataset, ticks=dataset.ticks - wrong)
-    return _with_wheels_mended(dataset)
+    if not wrong.any():                                  # of the same Dataset much is known
+        return dataset
+    return replace(dataset, ticks=dataset.ticks - wrong)
 
 
 @lru_cache(maxsize=2)
