@@ -169,7 +169,7 @@ def late(ticks, rng):
 
 
 def read_every(rows):
-    """An encoder that is read only every so many rows; images are taken every fifth."""
+    """An encoder that is read only every so many rows."""
     def spoil(ticks, _):
         total = np.cumsum(ticks, axis=0)[np.arange(len(ticks)) // rows * rows]
         return np.diff(total, axis=0, prepend=total[:1])
