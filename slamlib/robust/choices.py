@@ -38,13 +38,12 @@ from slamlib.robust.calibration import RADII, WHEEL_SCALE, WHEELS, Prior
 from slamlib.robust.error_memory import runs
 from slamlib.robust.factors import odometry_error, preintegrate_odometry
 from slamlib.robust.fit import (
-    CAUCHY_SCALES,
     ROUGH,
     Fit,
     accepted_measurements,
     has_memory,
-    narrow_kernels,
     refine,
+    refine_like,
     refine_without_memory,
     relinearized,
     residuals,
@@ -579,11 +578,9 @@ def _with_more_jumps(fit, jumps):
     more = replace(fit.problem.measurements, jumps=jumps)
     problem = relinearized(replace(fit.problem, measurements=more), fit.state)
     try:
-        state = narrow_kernels(problem, fit.state, CAUCHY_SCALES[-1:])
-        found = refine(problem, state)
+        return refine_like(problem, fit.state, fit)
     except (DatasetError, np.linalg.LinAlgError):
         return None
-    return replace(found, explanations=fit.explanations, lead=fit.lead)
 
 
 def _with_jumps(dataset, start, decide, bump):

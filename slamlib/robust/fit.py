@@ -213,6 +213,13 @@ def refine(problem: Problem, state: State,
     return _settled_fit(problem, state, with_memory)
 
 
+def refine_like(problem: Problem, state: State, decided: Fit) -> Fit:
+    """The Fit by the last kernel, then as of `refine`, with the explanations of another Fit."""
+    state = narrow_kernels(problem, state, CAUCHY_SCALES[-1:])
+    fit = refine(problem, state)
+    return replace(fit, explanations=decided.explanations, lead=decided.lead)
+
+
 def refine_without_memory(problem: Problem, state: State) -> Fit:
     """The Fit as of `refine` in which all errors are independent."""
     problem = replace(problem, noise=noise_of_scatter(problem, state))

@@ -192,15 +192,18 @@ def wrong_counts(dataset: Dataset) -> np.ndarray:
         return min(_cost(markers, each, sigma, _by_camera(each)) for each in late)
 
     def least_gain(cost):
-        """What the cost must change by, in the variance that it shows in x and y of each."""
+        """MIN_MENDED_GAIN, times the mean squared residual that a cost shows if this exceeds 1."""
         return MIN_MENDED_GAIN * max(1.0, cost / (2 * len(wheels)))
 
-    read = _mended(ticks, _read_rarely)
-    if (read != ticks).any():
-        as_logged = np.inf if are_few else cost(ticks, DELAYS)
-        if are_few or cost(read, DELAYS) <= as_logged + least_gain(as_logged):
-            log.info("wheels: encoders are read less often than they are logged")
-            ticks = read
+    def contradict(mended):
+        """Whether the markers agree with the counts as logged, but not with those `mended`."""
+        as_logged = cost(ticks, DELAYS)
+        return cost(mended, DELAYS) > as_logged + least_gain(as_logged)
+
+    in_time = _mended(ticks, _read_rarely)
+    if (in_time != ticks).any() and (are_few or not contradict(in_time)):
+        log.info("wheels: encoders are read less often than they are logged")
+        ticks = in_time
     if are_few:
         return dataset.ticks - ticks
     least = cost(ticks)
@@ -232,9 +235,11 @@ def _read_rarely(counts):
     """
     rows = np.arange(len(counts))
     read = rows[1:][counts[1:] != 0]
+    if len(read) < 2:
+        return counts
     pauses = np.diff(read)
-    is_rare = np.mean(pauses > 1) > MOSTLY if len(pauses) else False
-    if not is_rare or np.median(np.abs(counts[read])) < MIN_SPEED:
+    is_fast = np.median(np.abs(counts[read])) >= MIN_SPEED
+    if not is_fast or np.mean(pauses > 1) <= MOSTLY:
         return counts
     usual = np.quantile(pauses, USUAL)
     since = np.maximum(read - usual, np.append(0, read[:-1]))

@@ -21,7 +21,7 @@ from slamlib.robust.choices import (
     memory_or_slip,
     most_consistent,
 )
-from slamlib.robust.fit import CAUCHY_SCALES, Fit, narrow_kernels, refine, settled
+from slamlib.robust.fit import Fit, narrow_kernels, refine_like, settled
 from slamlib.robust.initialization import initial_state, state_from_poses
 from slamlib.robust.jumps import NO_JUMPS
 from slamlib.robust.linear import build_problem
@@ -140,9 +140,7 @@ def fit_from_odometry(measurements: Measurements, model: str = "arc",
     if like is None:                                                                  # 6
         return memory_or_slip(problem, state)
     problem = _with_decisions(problem, like.problem)
-    state = narrow_kernels(problem, replace(state, c=like.state.c), CAUCHY_SCALES[-1:])
-    fit = refine(problem, state)
-    return replace(fit, explanations=like.explanations, lead=like.lead)
+    return refine_like(problem, replace(state, c=like.state.c), like)
 
 
 def _with_decisions(problem, decided):
@@ -160,6 +158,4 @@ def fit_from_previous(measurements: Measurements, previous: SlamResult,
     problem = _with_decisions(problem, previous.fit.problem)
     c = m.calibration.taken_from(previous.calibration, previous.c)
     state = state_from_poses(m, previous.poses[m.frame], previous.covariances[m.frame], c)
-    state = narrow_kernels(problem, state, CAUCHY_SCALES[-1:])
-    return replace(refine(problem, state), explanations=previous.explanations,
-                   lead=previous.fit.lead)
+    return refine_like(problem, state, previous.fit)
