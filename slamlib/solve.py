@@ -22,7 +22,7 @@ import numpy as np
 
 from slamlib import estimate, fuse, fuse_increments, localize
 from slamlib.core import evaluation, odometry, se2
-from slamlib.core.errors import DatasetError, require
+from slamlib.core.errors import UNSOLVABLE, DatasetError, require
 from slamlib.core.records import NO_RANGES, NO_SIGHTINGS, Dataset, Truth
 from slamlib.io import files, results
 from slamlib.io.dataset import read_dataset, read_truth, write_vehicle
@@ -34,8 +34,6 @@ from slamlib.robust.solution_doubts import (
     fusion_doubts,
     solution_doubts,
 )
-
-UNSOLVABLE = (DatasetError, np.linalg.LinAlgError)  # what `find` raises where there is no solution
 
 
 class Task(NamedTuple):

@@ -1,8 +1,24 @@
-"""The error that is told in one sentence."""
+"""Errors that are told in one sentence."""
+
+from collections.abc import Callable
+from typing import Any
+
+from numpy.linalg import LinAlgError
 
 
 class DatasetError(ValueError):
     """A dataset does not follow the format; one sentence names file, line and expectation."""
+
+
+UNSOLVABLE = (DatasetError, LinAlgError)     # what is raised where there is no solution
+
+
+def if_solvable(solve: Callable, *arguments: Any) -> Any:
+    """What a function makes of its arguments, or None if there is no solution."""
+    try:
+        return solve(*arguments)
+    except UNSOLVABLE:
+        return None
 
 
 def require(ok: bool, source: str, expected: str, found: object = None) -> None:

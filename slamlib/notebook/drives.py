@@ -16,7 +16,7 @@ from pathlib import Path
 from IPython.display import Markdown, display
 
 from slamlib import solve
-from slamlib.core.errors import require
+from slamlib.core.errors import UNSOLVABLE, require
 from slamlib.core.records import Dataset, Truth
 from slamlib.io.dataset import read_dataset, read_truth
 from slamlib.io.tables import datasets_in
@@ -111,7 +111,7 @@ def attempt(drive: Drive, problem: str | None = None) -> Iterator[None]:
     log.addHandler(warnings)
     try:
         yield
-    except solve.UNSOLVABLE as error:
+    except UNSOLVABLE as error:
         if problem is None:
             _say(drive, f"left out here: {error}.")
         else:

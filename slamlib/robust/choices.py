@@ -30,7 +30,7 @@ from typing import NamedTuple
 import numpy as np
 
 from slamlib.core import se2
-from slamlib.core.errors import DatasetError
+from slamlib.core.errors import if_solvable
 from slamlib.core.increments import TYPICAL_SLIP
 from slamlib.core.records import ArucoReadings, Dataset
 from slamlib.core.sightings import GATE
@@ -130,24 +130,16 @@ def memory_or_slip(problem: Problem, state: State) -> Fit:
     found = by_slip if explains else refine(memory_first, state)
     is_large = problem.measurements.learned[0] and found.problem.noise.slip >= LARGE_SLIP
     if is_large and not _is_rounding(found):
-        by_images = _refined(replace(problem, max_slip=SMALL_SLIP), state)
+        by_images = if_solvable(refine, replace(problem, max_slip=SMALL_SLIP), state)
         if by_images is not None and not _predicts_better(found, by_images, 1.0):
             return by_images
     if not explains:
         return found
-    by_memory = _refined(memory_first, state)
+    by_memory = if_solvable(refine, memory_first, state)
     if by_memory is None or (by_memory.problem.accepted.share == 1).all():
         return by_slip
     needed = FAR_BETTER if is_large else BETTER
     return by_slip if _predicts_better(by_slip, by_memory, needed) else by_memory
-
-
-def _refined(problem, state):
-    """The Fit of a Problem, or None if it has no solution."""
-    try:
-        return refine(problem, state)
-    except (DatasetError, np.linalg.LinAlgError):
-        return None
 
 
 def _is_rounding(fit):
@@ -266,16 +258,15 @@ def _released(fit, proposal):
     c = np.where(proposal.prior.active, fit.state.c, stated)
     problem = replace(fit.problem, prior=proposal.prior)
     names = ", ".join(sorted(proposal.prior.groups)) or "nothing"
-    try:
-        solve = memory_or_slip if problem.memory_first else refine
-        proposed = solve(problem, replace(fit.state, c=c))
-        lead = _lead(proposed, fit) if _is_solved(proposed) else -np.inf
-    except (DatasetError, np.linalg.LinAlgError):
+    solve = memory_or_slip if problem.memory_first else refine
+    proposed = if_solvable(solve, problem, replace(fit.state, c=c))
+    if proposed is None or not _is_solved(proposed):
         log.info("calibration: %s released, no solution: refused", names)
         return None
+    lead = _lead(proposed, fit)
     needed = 0.0 if proposal.lead >= 0 else proposal.lead - DECISIVE_RELEASE
     needed += _price_of_far(proposed, proposal.prior.groups - fit.problem.prior.groups)
-    is_kept = not lead < needed
+    is_kept = lead >= needed
     log.info("calibration: %s released, log evidence %+.1f (predicted %+.1f): %s", names, lead,
              proposal.lead, "kept" if is_kept else "refused")
     if not is_kept:
@@ -496,7 +487,7 @@ def _likelihood(fit):
 def _lead(proposed, present):
     """Log evidence of a Fit minus that of another, by what both accept, noise learned.
 
-    With the shares of `proposed`.
+    With the shares of `proposed`. Minus infinity if what both accept has no solution.
     """
     accepted = _with_fixed_weights(proposed)
     in_both = [replace(kind, weight=kind.weight * (other.weight > 0))
@@ -504,9 +495,12 @@ def _lead(proposed, present):
 
     def log_density(fit):
         problem = replace(fit.problem, accepted=AcceptedMeasurements(*in_both))
-        return refine(problem, fit.state, accept=None).log_density
+        return refine(problem, fit.state, None).log_density
 
-    return log_density(proposed) - log_density(present)
+    of_both = [if_solvable(log_density, fit) for fit in (proposed, present)]
+    if None in of_both:
+        return -np.inf
+    return of_both[0] - of_both[1]
 
 
 def _with_fixed_weights(fit):
@@ -544,9 +538,9 @@ def most_consistent(
             count = len(np.unique(places[places[:, 0] != places[:, 1], 1]))
             are_needed = partial(
                 spares_sightings, explanation="places of ids", least=MIN_SPARED * count)
-            if are_needed(_alternative(start, fit, no_jumps, places), fit):
+            if are_needed(if_solvable(start, no_jumps, places, fit), fit):
                 with_places = decide(start(no_jumps, places))
-                without = _alternative(start, with_places, no_jumps)
+                without = if_solvable(start, no_jumps, None, with_places)
                 if without is None:
                     return with_places, places
                 fit = decide(without)
@@ -565,22 +559,11 @@ def most_consistent(
     return fit, None
 
 
-def _alternative(start, fit, jumps, places=None):
-    """The Fit of Jumps and places with the decisions of a Fit, or None if it has no solution."""
-    try:
-        return start(jumps, places, fit)
-    except (DatasetError, np.linalg.LinAlgError):
-        return None
-
-
 def _with_more_jumps(fit, jumps):
     """The Fit with more Jumps, from the solution and decisions of a Fit, or None."""
     more = replace(fit.problem.measurements, jumps=jumps)
     problem = relinearized(replace(fit.problem, measurements=more), fit.state)
-    try:
-        return refine_like(problem, fit.state, fit)
-    except (DatasetError, np.linalg.LinAlgError):
-        return None
+    return if_solvable(refine_like, problem, fit.state, fit)
 
 
 def _with_jumps(dataset, start, decide, bump):
@@ -593,7 +576,7 @@ def _with_jumps(dataset, start, decide, bump):
     no_jumps = jumps.none()
     fit = decide(start(jumps if jumps.are_few else no_jumps))
     if jumps.are_few:
-        without = _alternative(start, fit, no_jumps)
+        without = if_solvable(start, no_jumps, None, fit)
         if without is not None:
             without = decide(without)
         are_told = (jumps.sigma < UNKNOWN_SIGMA).all()           # by markers
@@ -603,7 +586,7 @@ def _with_jumps(dataset, start, decide, bump):
             if not spares_sightings(fit, without, "jumps", least):
                 fit = without
     elif found:
-        alternative = _alternative(start, fit, jumps)
+        alternative = if_solvable(start, jumps, None, fit)
         if spares_sightings(alternative, fit, "jumps", found + jumps.causes):
             fit = decide(start(jumps))
     log.info("jumps: %d of %d are believed", len(fit.problem.measurements.jumps.start), found)
@@ -619,12 +602,7 @@ def _spares_slip(fit, other):
 
 def _lead_of_jumps(fit, other):
     """Log evidence of a Fit with more jumps over that of another, none if there is no solution."""
-    if fit is None:
-        return -np.inf
-    try:
-        lead = _lead(fit, other)
-    except (DatasetError, np.linalg.LinAlgError):        # by what both accept
-        return -np.inf
+    lead = -np.inf if fit is None else _lead(fit, other)
     log.info("jumps: log evidence %+.1f", lead)
     return lead
 
@@ -728,9 +706,9 @@ def places_of_ids(aruco: ArucoReadings, start: Callable[..., Fit]) -> np.ndarray
     """
     marker = aruco.marker
     number = visits(aruco)
-    try:
-        result = slam_result(start(places=np.stack([marker, number], axis=1)))
-    except (DatasetError, np.linalg.LinAlgError):
+    fit = if_solvable(start, np.stack([marker, number], axis=1))
+    result = None if fit is None else if_solvable(slam_result, fit)
+    if result is None:
         return None
     place = np.zeros_like(marker)
     for each in np.unique(marker):
