@@ -44,6 +44,7 @@ from slamlib.robust.linear import (
 )
 from slamlib.robust.measurements import NOISE_KEYS, Noise, measure
 from slamlib.robust.noise import learn_noise
+from slamlib.robust.optimize import optimize
 from slamlib.robust.pipeline import fit_from_odometry
 from slamlib.robust.result import slam_result
 from slamlib.robust.solution_doubts import GROUPS, solution_doubts
@@ -340,6 +341,22 @@ def test_derivatives_have_expected_turns_but_those_of_corners_as_counted():
     assert_allclose(J[is_corner, 2], plain.J_wheel[is_corner, 2], rtol=0.05)
     straight = slice(0, 25)
     assert J[straight, 2, 2].std() < 0.3 * plain.J_wheel[straight, 2, 2].std()
+
+
+def test_the_evidence_is_the_same_by_odometry_linearised_at_other_wheels():
+    """For a released wheelbase, of which a longer one makes the noise of turns no smaller."""
+    m = measure(simulation.simulate("long", 1)[0].without("uwb"))
+    noise = Noise(2e-3)
+    problem = replace(build_problem(m, "arc", noise), prior=m.calibration.prior({"wheelbase"}))
+    state = optimize(problem, initialization.initial_state(m, "arc")).state
+
+    def log_evidence(factor):
+        wheel = m.dataset.vehicle.wheel * [1, 1, factor]
+        odometry = factors.preintegrate_odometry(m, "arc", wheel, noise.slip)
+        elsewhere = replace(problem, odometry=odometry)
+        return laplace_approximation(optimize(elsewhere, state).equations, noise)[1]
+
+    assert_allclose([log_evidence(0.97), log_evidence(1.03)], log_evidence(1.0), atol=0.5)
 
 
 @pytest.mark.parametrize("times", [(1.1, 1.1, 1.0), (1.0, 1.0, 1.2), (1.1, 1.1, 1.1)])

@@ -204,22 +204,16 @@ def count_scale(increments: OdometryIncrements, wheel: np.ndarray) -> np.ndarray
     """Scale s(w) (3,) from errors of OdometryIncrements by `wheel` (3,) m to the stated wheels.
 
     Encoders measure counts, and Q is the noise of the counts, in metres and radians by the stated
-    wheels. With the mean radius R and the wheelbase b of the wheels w, a count is a distance
-    proportional to R and a turn proportional to R / b. So errors shrink with R while Q does not,
-    and all lengths would be estimated too small where nothing else gives the scale. The errors by
-    the stated wheels do not shrink:
+    wheels. With the mean radius R of the wheels w, a count is a distance proportional to R. So
+    errors shrink with R while Q does not, and all lengths would be estimated too small where
+    nothing else gives the scale. The errors by the stated wheels do not shrink:
 
-        s(w) = [R_stated / R, R_stated / R, (R_stated / R_0) (b_0 / b_stated)].
+        s(w) = [R_stated / R, R_stated / R, 1].
 
-    The turn is scaled by the wheels w_0 of linearisation: the derivative of a scale that varies
-    would contain the noise of the turn, which does not average out (`robust.factors`).
+    The noise of a turn stays as it is by the stated wheels (`robust.factors`).
     """
-    stated = increments.stated
-    linear = increments.wheel
-    radius = stated[:2].mean()
-    along = radius / wheel[:2].mean()
-    turned = radius / linear[:2].mean() * linear[2] / stated[2]
-    return np.array([along, along, turned])
+    along = increments.stated[:2].mean() / wheel[:2].mean()
+    return np.array([along, along, 1.0])
 
 
 def odometry_noise(ticks: np.ndarray, vehicle: Vehicle, start: np.ndarray,

@@ -55,39 +55,45 @@ def preintegrate_odometry(measurements: Measurements, model: str,
     the stated wheels have it: to them all noise belongs.
     """
     frame = measurements.frame
-    increments = preintegrate(
-        measurements.dataset, frame, model, wheel, measurements.odometry_noise)
+    increments = _with_noise_as_stated(preintegrate(
+        measurements.dataset, frame, model, wheel, measurements.odometry_noise), slip)
     jump, jump_covariance = measurements.jumps.added(frame[:-1], frame[1:])
     off = increments.stated - increments.wheel
     as_stated = increments.increment + increments.J_wheel @ off
     creep = creep_covariance(as_stated, measurements.crawls)
     uncertain = jump_covariance + se2.rotate_covariance(creep, -increments.increment[:, 2])
-    return replace(
-        increments, increment=se2.compose(increments.increment, jump),
-        J_wheel=_by_wheel_without_noise(increments, slip), rounding=increments.rounding + uncertain)
+    return replace(increments, increment=se2.compose(increments.increment, jump),
+                   rounding=increments.rounding + uncertain)
 
 
-def _by_wheel_without_noise(increments, slip):
-    """The J_wheel of OdometryIncrements, from whose turns the noise is taken as far as it shows.
+def _with_noise_as_stated(increments, slip):
+    """The OdometryIncrements in which the noise of turns, as far as it shows, is as stated.
 
-    A turn is proportional to the radii over the wheelbase, so its derivatives contain the turn as
-    it was counted, with the same noise as its error. The products of both do not average out: on
-    long straight ways released wheels would run away. So each turn becomes what is expected, given
-    its neighbours and the noise (regression calibration: Carroll et al., Measurement Error in
-    Nonlinear Models, 2006; by the filter of Lee, IEEE PAMI 2(2), 1980): the mean of the neighbours
-    where all scatter is noise, the turn itself in a corner. The noise turned the increment about
-    its middle.
+    A turn is proportional to the radii over the wheelbase, and so would be its noise. Then the
+    derivatives would contain the turn as it was counted, with the same noise as its error, and the
+    products of both do not average out: on long straight ways released wheels would run away. Also,
+    the evidence would prefer a longer wheelbase, by which the noise is smaller. So only the turn
+    that is expected, given its neighbours and the noise, depends on the wheels (regression
+    calibration: Carroll et al., Measurement Error in Nonlinear Models, 2006; by the filter of Lee,
+    IEEE PAMI 2(2), 1980): the mean of the neighbours where all scatter is noise, the turn itself in
+    a corner. The noise turned the increment about its middle.
     """
+    wheel = increments.wheel
+    stated = increments.stated
+    ratio = wheel[:2].sum() / stated[:2].sum() * stated[2] / wheel[2]     # of turns
     steps = np.diff(increments.frame)
-    rate = increments.increment[:, 2] / steps
+    rate = increments.increment[:, 2] / (ratio * steps)
     mean = _mean_of_neighbours(rate)
     scatter = _mean_of_neighbours((rate - mean)**2)
     variance = increments.covariance(TURN_NOISE * slip)[:, 2, 2] / steps**2
     noise = steps * (rate - mean) * variance / np.maximum(scatter, variance)
     x, y = increments.increment[:, :2].T
     about_middle = np.stack([-y / 2, x / 2, np.ones(len(x))], axis=1)
-    of_wheels = np.array([0.5, 0.5, -1.0]) / increments.wheel        # of the logarithm of a turn
-    return increments.J_wheel - (noise[:, None] * about_middle)[:, :, None] * of_wheels
+    motion = noise[:, None] * about_middle
+    of_wheels = np.array([0.5, 0.5, -1.0]) / wheel                   # of the logarithm of a turn
+    return replace(
+        increments, increment=increments.increment + (1 - ratio) * motion,
+        J_wheel=increments.J_wheel - motion[:, :, None] * (ratio * of_wheels))
 
 
 def _mean_of_neighbours(values):
