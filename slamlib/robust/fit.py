@@ -17,7 +17,7 @@ from gtsam import noiseModel
 from slamlib.core.kernels import KERNELS, ONE_SIDED_BIAS
 from slamlib.core.sightings import GATE, MEDIAN_CHI2, POINT_GATE
 from slamlib.robust.calibration import RANGE_LAG, SIGHTING_LAG, WHEELS
-from slamlib.robust.error_memory import Memory, error_memory
+from slamlib.robust.error_memory import Memory, error_memory, memory_of_each
 from slamlib.robust.factors import linearize_measurements, preintegrate_odometry
 from slamlib.robust.linear import (
     NormalEquations,
@@ -48,6 +48,7 @@ MIN_RESIDUALS = 20           # number of measurements from which their scatter g
 
 DRAWS = 8                    # number of draws from the posterior, for products of errors
 MAX_ROUNDS = 20              # number of rounds of wheels, noise and accepted measurements
+FREE_ROUNDS = 12             # of these, after which the shares of memory only fall
 NEGLIGIBLE_MOVE = 3e-3       # relative, of a wheel parameter since odometry was linearised
 SETTLED_MOVE = 1e-6          # the same, at the solution that is handed in
 MAX_SINCE = 0.5              # encoder steps, of a delay since then
@@ -115,9 +116,9 @@ def error_memories(problem: Problem, state: State,
     of_sightings = error_memory(
         m.marker_row, m.frame[m.sightings.row], sightings.e, changes[0],
         accepted.sightings.weight > 0)
-    of_ranges = error_memory(
+    of_ranges = memory_of_each(
         m.ranges.antenna, m.frame[m.ranges.row], ranges.e, changes[1],
-        is_direct & (accepted.ranges.weight > 0), adds_lack=False)
+        is_direct & (accepted.ranges.weight > 0))
     return of_sightings, of_ranges
 
 
@@ -235,8 +236,8 @@ def has_memory(fit: Fit) -> bool:
 def _settled_fit(problem, state, accept):
     """The Fit after rounds of wheels, noise and accepted measurements.
 
-    They end where the calibration is impossible. The Problem has the measurements that `accept`
-    made before the last solution.
+    They end where the calibration is impossible. Memory may come and go, so that after some rounds
+    shares only fall. The Problem has the measurements that `accept` made before the last solution.
     """
     m = problem.measurements
     posterior = None
@@ -250,6 +251,9 @@ def _settled_fit(problem, state, accept):
         optimum = optimize(problem, state)
         state = optimum.state
         accepted = accept(replace(problem, reference=state.c), state)
+        if number > FREE_ROUNDS:
+            accepted = accepted.with_shares(
+                np.minimum(new.share, old.share) for new, old in zip(accepted, problem.accepted))
         changed = sum(np.count_nonzero(_has_changed(new, old))
                       for new, old in zip(accepted, problem.accepted))
         log.info("round %d: slip %.3g mm after 1 m, factors %.3g and %.3g; accepted %d of %d "

@@ -195,8 +195,12 @@ def _noise_doubts(result):
 def _memory_doubt(result, kind, share):
     """The Doubt on errors with memory, of which measurements keep the shares (m,)."""
     correlation = result.correlation[kind.column - 1]
+    measured = kind.name
+    if kind == RANGES:
+        m = result.fit.problem.measurements
+        measured += f" (antenna {_listed(m.antenna[m.ranges.antenna[share < 1]])})"
     return Doubt(f"{kind.doubt}-memory", (
-        f"Errors of successive {kind.name} are alike: their correlation is {correlation:.2f}. So "
+        f"Errors of successive {measured} are alike: their correlation is {correlation:.2f}. So "
         f"{_problem(result)} counts {len(share)} {kind.name} as {share.sum():.0f}, with "
         f"{result.noise[kind.column]:.2g} times the standard deviations in {kind.file}."), (
         "Look at the calibration of the sensor, and for what moves, blurs, hides or reflects."))
