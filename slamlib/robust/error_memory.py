@@ -19,9 +19,9 @@ lag, since the solution then takes over more than its posterior says:
 
     rho = mean of u u' + 1 - mean of u^2.
 
-Not so for ranges: what those of an antenna have in common is an entry of the calibration. A wall
-stands before one antenna and not before the others, so each has its own correlation
-(`memory_of_each`). What is not used for this, such as an echo, keeps as much as the others do on
+Not so for ranges: what those of an antenna have in common is an entry of the calibration. A wall may
+stand before one antenna and not before the others: where their correlations differ by more than
+chance, each has its own (`memory_of_each`). What is not used for this, such as an echo, keeps as much as the others do on
 average: it must not outweigh them.
 
 After a break the sensor sees the landmark from elsewhere, with another error.
@@ -79,14 +79,12 @@ def runs(landmark: np.ndarray, pose: np.ndarray, max_pause: float) -> tuple[floa
 
 
 def error_memory(landmark: np.ndarray, pose: np.ndarray, r: np.ndarray, changes: np.ndarray,
-                 used: np.ndarray, adds_lack: bool = True,
-                 min_significance: float = MIN_SIGNIFICANCE) -> Memory:
+                 used: np.ndarray, adds_lack: bool = True) -> Memory:
     """The Memory of measurements of `landmark` (m,), rows or ids, at encoder poses (m,).
 
     r (m, d) are residuals in standard deviations of the errors; k draws from the posterior change
     them by `changes` (m, d, k). Those not `used` (m,) do not count. `adds_lack` is whether what the
-    mean of u^2 lacks of 1 is added, `min_significance` how many of its standard deviations the
-    correlation of neighbours must be.
+    mean of u^2 lacks of 1 is added.
     """
     rows = np.flatnonzero(used)
     rows = rows[np.lexsort((pose[rows], landmark[rows]))]
@@ -105,7 +103,7 @@ def error_memory(landmark: np.ndarray, pose: np.ndarray, r: np.ndarray, changes:
     correlation = covariance[1] / variance
     neighbours = count[1] * r.shape[1]
     sigma = 1 / np.sqrt(max(neighbours, 1))
-    if correlation >= max(MIN_CORRELATION, min_significance * sigma):
+    if correlation >= max(MIN_CORRELATION, MIN_SIGNIFICANCE * sigma):
         rho = covariance + adds_lack * max(0.0, 1 - variance)
         remembered = (rho >= MIN_RHO) & (count >= MIN_PAIRS)
         remembered[0] = True                         # pairs of less than half an interval
@@ -119,23 +117,23 @@ def error_memory(landmark: np.ndarray, pose: np.ndarray, r: np.ndarray, changes:
 
 
 def memory_of_each(landmark: np.ndarray, *columns: np.ndarray) -> Memory:
-    """The Memory where each landmark has its own, with the most significant of their correlations.
+    """The Memory of all, or where their correlations differ that of each landmark by itself.
 
-    The other `columns` are those of `error_memory`. What the mean of u^2 lacks is not added. Where
-    the correlation of all together is significant, that of each need not be. A landmark with few
-    measurements has the memory of all.
+    The other `columns` are those of `error_memory`. What the mean of u^2 lacks is not added. The
+    correlation of several memories is the most significant one.
     """
     of_all = error_memory(landmark, *columns, adds_lack=False)
-    needed = 0.0 if (of_all.share < 1).any() else MIN_SIGNIFICANCE
-    share = of_all.share.copy()
-    strongest = of_all
-    for each in np.unique(landmark):
-        rows = np.flatnonzero(landmark == each)
-        if len(rows) > MIN_PAIRS:
-            of_each = [column[rows] for column in (landmark, *columns)]
-            memory = error_memory(*of_each, adds_lack=False, min_significance=needed)
-            share[rows] = memory.share
-            strongest = max(strongest, memory, key=attrgetter("significance"))
+    rows_of_each = [landmark == each for each in np.unique(landmark)]
+    each = [error_memory(*(column[rows] for column in (landmark, *columns)), adds_lack=False)
+            for rows in rows_of_each]
+    freedom = len(each) - 1
+    off = [(memory.correlation - of_all.correlation) / memory.sigma for memory in each]
+    if np.sum(np.square(off)) < freedom + MIN_SIGNIFICANCE * np.sqrt(2 * max(freedom, 1)):
+        return of_all
+    share = np.empty(len(landmark))
+    for rows, memory in zip(rows_of_each, each):
+        share[rows] = memory.share
+    strongest = max(each, key=attrgetter("significance"))
     return replace(strongest, share=share)
 
 
