@@ -64,7 +64,7 @@ def test_rows_of_another_study_are_refused_in_a_sentence(written, name, other, s
 
 
 @pytest.mark.parametrize("value, same", [("0.667", True), ("0.668", False)])
-def test_the_first_seeds_computed_again_confirm_the_rows(written, monkeypatch, value, same):
+def test_the_first_seed_computed_again_confirms_the_rows(written, monkeypatch, value, same):
     written.write_text(written.read_text().replace("0.6666667", value))
     monkeypatch.setenv("SLAMLIB_STUDIES", "check")
     if same:
@@ -96,7 +96,7 @@ def checked(name, *arguments, rows=studies.rows, **options):
 @pytest.mark.slow
 @pytest.mark.usefixtures("look")
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
-def test_the_first_two_seeds_of_every_study_are_what_its_file_says(notebook, tmp_path, monkeypatch):
+def test_the_first_seed_of_every_study_is_what_its_file_says(notebook, tmp_path, monkeypatch):
     """After a change of the numerics that is meant, `make studies` writes the files anew.
 
     A seed of the long path takes 40 s.

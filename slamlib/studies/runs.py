@@ -3,7 +3,7 @@
 A study depends on slamlib only, not on a user's datasets. Its rows are a CSV file in the folder
 `studies` beside the notebook, from which `rows` reads them. `make studies` executes the notebooks
 with SLAMLIB_STUDIES=write: `rows` then computes and writes them. With SLAMLIB_STUDIES=check, as a
-test has it, `rows` computes the first two seeds of each again and compares.
+test has it, `rows` computes the first seed of each again and compares.
 """
 
 import os
@@ -52,7 +52,7 @@ def rows(name: str, trial: Callable, seeds: Sequence[int], **options) -> pd.Data
     require(list(found.index) == list(seeds), file, f"rows of {trial.__name__} by the seeds and "
             "options of this call, as 'make studies' writes them; studies.run computes others")
     if mode == "check":
-        again = run(trial, seeds[:2], **options)
+        again = run(trial, seeds[:1], **options)
         pd.testing.assert_frame_equal(found.loc[again.index], again, check_dtype=False,
                                       rtol=TOLERANCE, atol=SMALLEST, obj=str(file))
     return found
