@@ -343,6 +343,19 @@ def test_derivatives_have_expected_turns_but_those_of_corners_as_counted():
     assert J[straight, 2, 2].std() < 0.3 * plain.J_wheel[straight, 2, 2].std()
 
 
+def test_the_noise_in_derivatives_is_that_of_the_learned_slip(monkeypatch):
+    """Also if the first round is the last. By a third of the slip a half of it would remain."""
+    drive_along([(60, 0)], monkeypatch)
+    for seed in (2, 4):
+        fit = fit_from_odometry(
+            measure(simulation.simulate("short", seed, slip=3e-3)[0].without("uwb")))
+        problem = fit.problem
+        expected = factors.preintegrate_odometry(
+            problem.measurements, "arc", problem.odometry.wheel, problem.noise.slip)
+        assert problem.noise.slip > 2e-3
+        assert_allclose(problem.odometry.J_wheel, expected.J_wheel, rtol=1e-9, atol=1e-12)
+
+
 def test_the_evidence_is_the_same_by_odometry_linearised_at_other_wheels():
     """For a released wheelbase, of which a longer one makes the noise of turns no smaller."""
     m = measure(simulation.simulate("long", 1)[0].without("uwb"))

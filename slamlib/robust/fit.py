@@ -244,10 +244,10 @@ def _settled_fit(problem, state, accept):
     accepted = accept(problem, state)
     is_settled = False
     for number in range(1, MAX_ROUNDS + 1):
-        problem = relinearized(replace(problem, accepted=accepted), state)
+        problem = replace(problem, accepted=accepted)
         if m.learned.any() and not is_settled:
-            problem, state, posterior = _settle_noise(problem, state)
-        problem = _with_least_slip(problem)
+            problem, state, posterior = _settle_noise(relinearized(problem, state), state)
+        problem = relinearized(_with_least_slip(problem), state)
         optimum = optimize(problem, state)
         state = optimum.state
         accepted = accept(replace(problem, reference=state.c), state)
