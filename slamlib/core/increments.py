@@ -29,6 +29,7 @@ MINIMUM_SKID = 1e-4         # sqrt(m), skid of an increment's end along either a
 MINIMUM_SIGMA = 1e-5        # m, standard deviation of an increment's end along x and y
 TYPICAL_SLIP = 1e-3         # sqrt(m), median of the prior
 SLIP_FACTOR = 3.0           # its logarithm is the standard deviation of the prior of log slip
+LARGE_RATIO = 1.1           # of turns to those by the stated wheels, up to which noise is as stated
 
 
 def between_poses(ticks: np.ndarray, vehicle: Vehicle, start: np.ndarray, end: np.ndarray,
@@ -208,12 +209,27 @@ def count_scale(increments: OdometryIncrements, wheel: np.ndarray) -> np.ndarray
     errors shrink with R while Q does not, and all lengths would be estimated too small where
     nothing else gives the scale. The errors by the stated wheels do not shrink:
 
-        s(w) = [R_stated / R, R_stated / R, 1].
-
-    The noise of a turn stays as it is by the stated wheels (`robust.factors`).
+        s(w) = [R_stated / R, R_stated / R, 1 / `noise_scale`].
     """
     along = increments.stated[:2].mean() / wheel[:2].mean()
-    return np.array([along, along, 1.0])
+    return np.array([along, along, 1 / noise_scale(increments)])
+
+
+def turn_ratio(increments: OdometryIncrements) -> float:
+    """Turns by the wheels of linearisation over those by the stated ones: of radius / wheelbase."""
+    wheel = increments.wheel
+    stated = increments.stated
+    return wheel[:2].sum() / stated[:2].sum() * stated[2] / wheel[2]
+
+
+def noise_scale(increments: OdometryIncrements) -> float:
+    """Noise of turns in OdometryIncrements over that by the stated wheels.
+
+    It is 1 near these, because over many increments the evidence would otherwise prefer wheels by
+    which the noise is smaller (`robust.factors`). Beyond LARGE_RATIO it is in proportion to turns.
+    """
+    ratio = turn_ratio(increments)
+    return ratio / np.clip(ratio, 1 / LARGE_RATIO, LARGE_RATIO)
 
 
 def odometry_noise(ticks: np.ndarray, vehicle: Vehicle, start: np.ndarray,

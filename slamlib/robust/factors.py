@@ -18,8 +18,10 @@ from slamlib.core.increments import (
     TYPICAL_SLIP,
     OdometryIncrements,
     count_scale,
+    noise_scale,
     odometry_error,
     preintegrate,
+    turn_ratio,
 )
 from slamlib.robust.calibration import (
     ANTENNAS,
@@ -67,7 +69,7 @@ def preintegrate_odometry(measurements: Measurements, model: str,
 
 
 def _with_noise_as_stated(increments, slip):
-    """The OdometryIncrements in which the noise of turns, as far as it shows, is as stated.
+    """The OdometryIncrements in which the noise of turns, as far as it shows, has `noise_scale`.
 
     A turn is proportional to the radii over the wheelbase, and so would be its noise. Then the
     derivatives would contain the turn as it was counted, with the same noise as its error, and the
@@ -78,9 +80,7 @@ def _with_noise_as_stated(increments, slip):
     IEEE PAMI 2(2), 1980): the mean of the neighbours where all scatter is noise, the turn itself in
     a corner. The noise turned the increment about its middle.
     """
-    wheel = increments.wheel
-    stated = increments.stated
-    ratio = wheel[:2].sum() / stated[:2].sum() * stated[2] / wheel[2]     # of turns
+    ratio = turn_ratio(increments)
     steps = np.diff(increments.frame)
     rate = increments.increment[:, 2] / (ratio * steps)
     mean = _mean_of_neighbours(rate)
@@ -90,9 +90,10 @@ def _with_noise_as_stated(increments, slip):
     x, y = increments.increment[:, :2].T
     about_middle = np.stack([-y / 2, x / 2, np.ones(len(x))], axis=1)
     motion = noise[:, None] * about_middle
-    of_wheels = np.array([0.5, 0.5, -1.0]) / wheel                   # of the logarithm of a turn
+    of_wheels = np.array([0.5, 0.5, -1.0]) / increments.wheel        # of the logarithm of a turn
+    added = (noise_scale(increments) - ratio) * motion
     return replace(
-        increments, increment=increments.increment + (1 - ratio) * motion,
+        increments, increment=increments.increment + added,
         J_wheel=increments.J_wheel - motion[:, :, None] * (ratio * of_wheels))
 
 
