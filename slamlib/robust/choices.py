@@ -706,8 +706,8 @@ def places_of_ids(aruco: ArucoReadings, start: Callable[..., Fit]) -> np.ndarray
     """
     marker = aruco.marker
     number = visits(aruco)
-    fit = if_solvable(start, np.stack([marker, number], axis=1))
-    result = None if fit is None else if_solvable(slam_result, fit)
+    visit_of_id = np.stack([marker, number], axis=1)
+    result = if_solvable(lambda: slam_result(start(visit_of_id)))
     if result is None:
         return None
     place = np.zeros_like(marker)
