@@ -117,22 +117,32 @@ def error_memory(landmark: np.ndarray, pose: np.ndarray, r: np.ndarray, changes:
 
 
 def memory_of_each(landmark: np.ndarray, *columns: np.ndarray) -> Memory:
-    """The Memory of all, or where their correlations differ that of each landmark by itself.
+    """The Memory of all, or that of the few landmarks beside which errors are independent.
 
-    The other `columns` are those of `error_memory`. What the mean of u^2 lacks is not added. The
-    correlation of several memories is the most significant one.
+    The other `columns` are those of `error_memory`. What the mean of u^2 lacks is not added. Each
+    of the few has its own memory, where correlations differ by more than chance, and at least half
+    of the landmarks, neither one by one nor together, have any. The correlation of several memories
+    is the most significant one.
     """
-    of_all = error_memory(landmark, *columns, adds_lack=False)
-    rows_of_each = [landmark == each for each in np.unique(landmark)]
-    each = [error_memory(*(column[rows] for column in (landmark, *columns)), adds_lack=False)
-            for rows in rows_of_each]
+    columns = landmark, *columns
+
+    def memory_of(rows):
+        return error_memory(*(column[rows] for column in columns), adds_lack=False)
+
+    of_all = memory_of(slice(None))
+    numbers = np.unique(landmark)
+    each = [memory_of(landmark == number) for number in numbers]
     freedom = len(each) - 1
     off = [(memory.correlation - of_all.correlation) / memory.sigma for memory in each]
     if np.sum(np.square(off)) < freedom + MIN_SIGNIFICANCE * np.sqrt(2 * max(freedom, 1)):
         return of_all
+    others = [number for number, memory in zip(numbers, each) if (memory.share == 1).all()]
+    are_few = 2 * len(others) >= len(each)
+    if not are_few or (memory_of(np.isin(landmark, others)).share < 1).any():
+        return of_all
     share = np.empty(len(landmark))
-    for rows, memory in zip(rows_of_each, each):
-        share[rows] = memory.share
+    for number, memory in zip(numbers, each):
+        share[landmark == number] = memory.share
     strongest = max(each, key=attrgetter("significance"))
     return replace(strongest, share=share)
 

@@ -35,7 +35,7 @@ from slamlib.robust.measurements import (
     with_known,
 )
 from slamlib.robust.noise import NoisePosterior, learn_noise, with_least_slip
-from slamlib.robust.optimize import optimize
+from slamlib.robust.optimize import Optimum, optimize
 
 log = logging.getLogger(__name__)
 
@@ -123,8 +123,8 @@ def error_memories(problem: Problem, state: State,
 
 
 def narrow_kernels(
-        problem: Problem, state: State, scales: Sequence[float] = CAUCHY_SCALES) -> State:
-    """The State after one solution for each scale of the Cauchy kernel, with all measurements.
+        problem: Problem, state: State, scales: Sequence[float] = CAUCHY_SCALES) -> Optimum:
+    """The last Optimum of one for each scale of the Cauchy kernel, with all measurements.
 
     The scales are in sigmas. The scatter of the residuals of each solution gives the noise of the
     next. Raises DatasetError as `optimize`.
@@ -139,7 +139,7 @@ def narrow_kernels(
         state = optimum.state
         log.info("Cauchy kernel of %g sigmas: error %.6g after %d steps",
                  scale, optimum.equations.error, optimum.steps)
-    return state
+    return optimum
 
 
 def noise_of_scatter(problem: Problem, state: State) -> Noise:
@@ -216,8 +216,8 @@ def refine(problem: Problem, state: State,
 
 def refine_like(problem: Problem, state: State, decided: Fit) -> Fit:
     """The Fit by the last kernel, then as of `refine`, with the explanations of another Fit."""
-    state = narrow_kernels(problem, state, CAUCHY_SCALES[-1:])
-    fit = refine(problem, state)
+    optimum = narrow_kernels(problem, state, CAUCHY_SCALES[-1:])
+    fit = refine(problem, optimum.state)
     return replace(fit, explanations=decided.explanations, lead=decided.lead)
 
 

@@ -28,11 +28,11 @@ has, in place of Z_last, the Z that is expected.
 
 Nobody states the slip. So several filters run side by side, each with its slip, and the likeliest
 by its innovations is taken (multiple models: Bar-Shalom, Li and Kirubarajan 2001, section 11.6).
-Stretches of the drive tell in advance which slips are tried, the memory, the factor on the standard
-deviations of the sightings, and whether the camera is elsewhere than stated. Beside slow errors, or
-larger ones than stated, no slip below the typical one is tried, as in the graph. The size of the
-markers is as stated. With the slip that was learned, smaller jumps show than before; they are
-believed if the likeliest filter, near them, is likelier with them.
+Stretches of the drive tell in advance which slips are tried, the memory, and the factor on the
+standard deviations of the sightings; the whole drive, whether the camera is elsewhere than stated.
+Beside slow errors, or larger ones than stated, no slip below the typical one is tried, as in the
+graph. The size of the markers is as stated. With the slip that was learned, smaller jumps show than
+before; they are believed if the likeliest filter, near them, is likelier with them.
 """
 
 from dataclasses import dataclass, replace
@@ -279,30 +279,20 @@ def _log_densities(dataset, jumps, models):
 def _learned_models(dataset, jumps, slip):
     """The _Models of the last filters, by the likeliest one in stretches of the drive.
 
-    First of filters that estimate the camera, then of those with its stated pose, memory and factor
-    as of the first.
+    That one estimates the camera. Stretches say little of it, so the last filters have it both
+    elsewhere and as stated.
     """
     tried = SLIPS if slip is None else [slip]
     factors = FACTORS if dataset.vehicle.marker_noise_factor is None else [1.0]
-    stretches = _stretches(dataset)
-
-    def likeliest(memories, elsewhere, factors):
-        models = _all_models(tried, memories, [elsewhere], factors)
-        densities = _log_densities(stretches, jumps, models)
-        best = densities.argmax()
-        return densities[best], _Models(*[field[best] for field in models])
-
-    density, best = likeliest(MEMORIES, True, factors)
-    density_as_stated, as_stated = likeliest([best.memory], False, [best.factor])
-    if density_as_stated >= density:
-        best = as_stated
+    models = _all_models(tried, MEMORIES, [True], factors)
+    likeliest = _log_densities(_stretches(dataset), jumps, models).argmax()
+    best = _Models(*[field[likeliest] for field in models])
     slips = tried
     if slip is None:
         are_poor = best.memory > 0 or best.factor > 1    # errors of the sightings
         least = TYPICAL_SLIP if are_poor else SLIP_BOUNDS[0]
         slips = np.unique(np.clip(best.slip * FINE_STEPS, least, SLIP_BOUNDS[1]))
-    elsewhere = np.unique([False, best.elsewhere])       # stretches say little of the camera
-    return _all_models(slips, [best.memory], elsewhere, [best.factor])
+    return _all_models(slips, [best.memory], [False, True], [best.factor])
 
 
 def _all_models(slips, memories, elsewhere, factors):

@@ -2,7 +2,9 @@
 
 On a long drive odometry loses the heading. Therefore its first part is solved by the robust rounds
 of stage 5. Odometry with the wheels that this part calibrated then predicts the poses of a longer
-part, and so on. Stage 7 uses trilateration again for the antennas in doubt.
+part, and so on. Each part is solved with the slip learned from the one before: wheels that are
+calibrated with a slip that is far too small explain the slip, and predict badly. Stage 7 uses
+trilateration again for the antennas in doubt.
 """
 
 from collections.abc import Callable
@@ -20,7 +22,8 @@ from slamlib.robust.calibration import ANTENNAS, HEIGHT, OFFSET, SCALE, SIGHTING
 from slamlib.robust.factors import MIN_DISTANCE, sensor_poses
 from slamlib.robust.fit import narrow_kernels
 from slamlib.robust.linear import State, build_problem, state_from_arrays
-from slamlib.robust.measurements import Measurements, measure
+from slamlib.robust.measurements import Measurements, Noise, measure
+from slamlib.robust.noise import learn_noise
 from slamlib.robust.optimize import cauchy_minimum
 
 MAX_ODOMETRY_SIGMA = 0.5     # rad, of odometry's heading at the end of a drive's first part
@@ -48,10 +51,14 @@ def initial_state(measurements: Measurements, model: str) -> State:
     frame = measurements.frame
     part = None
     state = None
+    noise = Noise()
     for count in part_lengths(dataset)[:-1]:
         longer = measure(dataset.first(count), frame[frame < count], measurements.jumps)
         state = odometry_state(longer, model, part, state)
-        state = narrow_kernels(build_problem(longer, model), state)
+        optimum = narrow_kernels(build_problem(longer, model, noise), state)
+        state = optimum.state
+        if longer.learned[0]:
+            noise = Noise(learn_noise(optimum.equations).noise.slip)
         part = longer
     return odometry_state(measurements, model, part, state)
 

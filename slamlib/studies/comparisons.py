@@ -46,7 +46,7 @@ def solve_with(measurements: Measurements, antennas=trilaterated_antennas) -> Fi
     """
     kernel = measurements.dataset.vehicle.kernel
     problem = build_problem(measurements, "arc")
-    start = narrow_kernels(problem, odometry_state(measurements, "arc", antennas=antennas))
+    start = narrow_kernels(problem, odometry_state(measurements, "arc", antennas=antennas)).state
     accept = partial(accepted_measurements, sightings=(kernel, True),
                      ranges=(kernel, kernel in ONE_SIDED_BIAS))
     return refine(problem, start, accept)
@@ -154,7 +154,7 @@ def confusions(seed: int, **options) -> dict:
             initial_error = distances(state.markers, right)
             numbers[f"{kind}, {name} initial error"] = np.sqrt(np.mean(initial_error**2))
             for kernel, scales in ROUNDS.items():
-                start = narrow_kernels(problem, state, scales)
+                start = narrow_kernels(problem, state, scales).state
                 error = distances(optimize(last, start).state.markers, right)
                 numbers[f"{kind}, {kernel}, {name} off"] = np.mean(error > MAX_MARKER_ERROR)
     return numbers
