@@ -535,16 +535,13 @@ def most_consistent(
         no_jumps = fit.problem.measurements.jumps.none()
         places = places_of_ids(dataset.aruco, partial(start, no_jumps, like=fit))
         if places is not None:
-            count = len(np.unique(places[places[:, 0] != places[:, 1], 1]))
-            are_needed = partial(
-                spares_sightings, explanation="places of ids", least=MIN_SPARED * count)
-            if are_needed(if_solvable(start, no_jumps, places, fit), fit):
+            if _needs_places(if_solvable(start, no_jumps, places, fit), fit, places):
                 with_places = decide(start(no_jumps, places))
                 without = if_solvable(start, no_jumps, None, with_places)
                 if without is None:
                     return with_places, places
                 fit = decide(without)
-                if are_needed(with_places, fit):
+                if _needs_places(with_places, fit, places):
                     return with_places, places
     for jumps in _overlooked(fit):
         count = len(jumps.start) - len(fit.problem.measurements.jumps.start)
@@ -557,6 +554,19 @@ def most_consistent(
     if jumps is not None and _lead_of_jumps(_with_more_jumps(fit, jumps), fit) > MIN_JUMP_LEAD:
         return decide(start(jumps)), None
     return fit, None
+
+
+def _needs_places(fit, other, places):
+    """Whether a Fit with `SlamResult.places` spares enough independent sightings, or is None.
+
+    Of sightings whose errors have memory several count as one. They disagree from visit to visit,
+    of most ids, and places of each visit would spare many.
+    """
+    if fit is None:
+        return False
+    count = len(np.unique(places[places[:, 0] != places[:, 1], 1]))
+    least = MIN_SPARED * count / fit.problem.accepted.sightings.share.mean()
+    return spares_sightings(fit, other, "places of ids", least)
 
 
 def _with_more_jumps(fit, jumps):
