@@ -20,9 +20,11 @@ lag, since the solution then takes over more than its posterior says:
     rho = mean of u u' + 1 - mean of u^2.
 
 Not so for ranges: what those of an antenna have in common is an entry of the calibration. A wall
-may stand before one antenna and not before the others: where their correlations differ by more
-than chance, each has its own (`memory_of_each`). What is not used for this, such as an echo, keeps
-as much as the others do on average: it must not outweigh them.
+may stand before one antenna and not before the others: if the errors of most are independent, each
+has its own memory (`memory_of_each`). Else all have the same. The path takes over the errors of the
+antenna that counts most, so that its residuals show less memory the more it counts. What is not
+used for this, such as an echo, keeps as much as the others do on average: it must not outweigh
+them.
 
 After a break the sensor sees the landmark from elsewhere, with another error.
 """
@@ -119,10 +121,10 @@ def error_memory(landmark: np.ndarray, pose: np.ndarray, r: np.ndarray, changes:
 def memory_of_each(landmark: np.ndarray, *columns: np.ndarray) -> Memory:
     """The Memory of all, or that of the few landmarks beside which errors are independent.
 
-    The other `columns` are those of `error_memory`. What the mean of u^2 lacks is not added. Each
-    of the few has its own memory, where correlations differ by more than chance, and at least half
-    of the landmarks, neither one by one nor together, have any. The correlation of several memories
-    is the most significant one.
+    The other `columns` are those of `error_memory`. What the mean of u^2 lacks is not added. The
+    few, at most half of the landmarks, have memories of their own, if the others have none, neither
+    one by one nor all of them together. The correlation of several memories is the most significant
+    one.
     """
     columns = landmark, *columns
 
@@ -132,18 +134,13 @@ def memory_of_each(landmark: np.ndarray, *columns: np.ndarray) -> Memory:
     of_all = memory_of(slice(None))
     numbers = np.unique(landmark)
     each = [memory_of(landmark == number) for number in numbers]
-    freedom = len(each) - 1
-    off = [(memory.correlation - of_all.correlation) / memory.sigma for memory in each]
-    if np.sum(np.square(off)) < freedom + MIN_SIGNIFICANCE * np.sqrt(2 * max(freedom, 1)):
-        return of_all
     others = [number for number, memory in zip(numbers, each) if (memory.share == 1).all()]
-    are_few = 2 * len(others) >= len(each)
-    if not are_few or (memory_of(np.isin(landmark, others)).share < 1).any():
+    if 2 * len(others) < len(each) or (memory_of(np.isin(landmark, others)).share < 1).any():
         return of_all
     share = np.empty(len(landmark))
     for number, memory in zip(numbers, each):
         share[landmark == number] = memory.share
-    strongest = max(each, key=attrgetter("significance"))
+    strongest = max(each, key=attrgetter("significance"), default=of_all)
     return replace(strongest, share=share)
 
 
