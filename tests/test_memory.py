@@ -161,7 +161,7 @@ def test_slip_first_or_memory_first_end_alike(options, correlation, slip):
     """Starts are wrong for one of them; the errors that the posterior expects lead to the truth."""
     measurements = measure(short(2, **options)[0].without("uwb"))
     problem = build_problem(measurements, "arc")
-    state = narrow_kernels(problem, initial_state(measurements, "arc")).state
+    state = narrow_kernels(problem, initial_state(measurements, "arc")[0]).state
     either = [refine(replace(problem, memory_first=first), state) for first in (True, False)]
     for fit in either:
         found = error_memories(fit.problem, fit.state, fit.problem.accepted)[0]
@@ -228,7 +228,7 @@ def test_images_with_wrong_pose_ids_are_no_slip_and_do_not_hide_a_wrong_size(lat
 def test_a_slip_comes_within_its_bound_from_above():
     measurements = measure(short(2)[0].without("uwb"))                 # by a slip of 1 mm
     problem = replace(build_problem(measurements, "arc", Noise(1.2e-3)), max_slip=5e-4)
-    state = narrow_kernels(problem, initial_state(measurements, "arc")).state
+    state = narrow_kernels(problem, initial_state(measurements, "arc")[0]).state
     assert refine(problem, state).problem.noise.slip == pytest.approx(5e-4, rel=0.01)
 
 

@@ -2,9 +2,9 @@
 
 On a long drive odometry loses the heading. Therefore its first part is solved by the robust rounds
 of stage 5. Odometry with the wheels that this part calibrated then predicts the poses of a longer
-part, and so on. Each part is solved with the slip learned from the one before: wheels that are
-calibrated with a slip that is far too small explain the slip, and predict badly. Stage 7 uses
-trilateration again for the antennas in doubt.
+part, and so on. Each part tells the slip: wheels that are calibrated with a slip that is far too
+small explain the slip, and predict badly. Stage 7 uses trilateration again for the antennas in
+doubt.
 """
 
 from collections.abc import Callable
@@ -20,14 +20,15 @@ from slamlib.core.records import Dataset
 from slamlib.core.sightings import consensus
 from slamlib.robust.calibration import ANTENNAS, HEIGHT, OFFSET, SCALE, SIGHTING_LAG, SIZE, WHEELS
 from slamlib.robust.factors import MIN_DISTANCE, sensor_poses
-from slamlib.robust.fit import narrow_kernels
+from slamlib.robust.fit import CAUCHY_SCALES, narrow_kernels
 from slamlib.robust.linear import State, build_problem, state_from_arrays
 from slamlib.robust.measurements import Measurements, Noise, measure
 from slamlib.robust.noise import learn_noise
 from slamlib.robust.optimize import cauchy_minimum
 
 MAX_ODOMETRY_SIGMA = 0.5     # rad, of odometry's heading at the end of a drive's first part
-MAX_FIRST_PART = 1.5         # length of the first part over that which odometry can predict
+MAX_FIRST_PART = 1.5         # length of the first part over that which odometry can predict, and
+                             # least ratio of the numbers of poses of two parts
 GROWTH = 4                   # largest ratio of the numbers of poses of a part and the one before
 
 MAX_RANGES = 150             # maximum number of ranges used per antenna, evenly chosen
@@ -42,25 +43,32 @@ MIN_TOO_SHORT = 0.2          # share of contradicting ranges; without line of si
 MIN_FITTING = 0.5            # share of contradicting ranges that fit one other position
 
 
-def initial_state(measurements: Measurements, model: str) -> State:
+def initial_state(measurements: Measurements, model: str) -> tuple[State, Noise]:
     """The State from which a drive is solved, by odometry of the model "arc" or "euler".
 
-    Raises DatasetError as `optimize`, for the first part of a long drive.
+    And the Noise with the slip that a long drive's parts tell, else the typical one. Raises
+    DatasetError as `optimize`, for the first part of a long drive.
     """
     dataset = measurements.dataset
     frame = measurements.frame
+    lengths = part_lengths(dataset)
     part = None
     state = None
     noise = Noise()
-    for count in part_lengths(dataset)[:-1]:
+    count = lengths[0]
+    while count < len(dataset.ticks):
         longer = measure(dataset.first(count), frame[frame < count], measurements.jumps)
         state = odometry_state(longer, model, part, state)
         optimum = narrow_kernels(build_problem(longer, model, noise), state)
-        state = optimum.state
         if longer.learned[0]:
             noise = Noise(learn_noise(optimum.equations).noise.slip)
+            optimum = narrow_kernels(
+                build_problem(longer, model, noise), optimum.state, CAUCHY_SCALES[-1:])
+        state = optimum.state
         part = longer
-    return odometry_state(measurements, model, part, state)
+        planned = next(length for length in lengths if length > count)
+        count = min(planned, _predictable(dataset, count, noise.slip))
+    return odometry_state(measurements, model, part, state), noise
 
 
 def part_lengths(dataset: Dataset) -> list[int]:
@@ -80,6 +88,18 @@ def part_lengths(dataset: Dataset) -> list[int]:
         length = max(first, -(-length // GROWTH))        # rounded up
         lengths.insert(0, length)
     return lengths
+
+
+def _predictable(dataset, count, slip):
+    """Number of poses of the part after one with `count`, whose headings odometry can predict.
+
+    With a slip in sqrt(m). At least MAX_FIRST_PART times as many poses.
+    """
+    vehicle = dataset.vehicle
+    travel = np.abs(dataset.ticks[count:] * vehicle.metres_per_count).sum(axis=1)
+    variance = np.cumsum(slip**2 * travel) / vehicle.wheelbase**2        # of the heading
+    predicted = count + np.searchsorted(variance, MAX_ODOMETRY_SIGMA**2)
+    return max(int(predicted), int(MAX_FIRST_PART * count))
 
 
 def odometry_state(measurements: Measurements, model: str, part: Measurements | None = None,

@@ -135,8 +135,9 @@ def fit_from_odometry(measurements: Measurements, model: str = "arc",
     """
     if like is not None:
         model = like.problem.odometry.model
+    state, noise = initial_state(measurements, model)                                 # 4
+    state = narrow_kernels(build_problem(measurements, model, noise), state).state    # 5
     problem = build_problem(measurements, model)                                      # 2
-    state = narrow_kernels(problem, initial_state(measurements, model)).state         # 4, 5
     if like is None:                                                                  # 6
         return memory_or_slip(problem, state)
     problem = _with_decisions(problem, like.problem)
