@@ -13,8 +13,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 from slamlib import estimate
 from slamlib.core.evaluation import ate, nees_band
 from slamlib.core.vehicle import TABLE_2
+from slamlib.robust import choices
 from slamlib.robust.choices import SMALL_SLIP, _squared_distance, visits
-from slamlib.robust.error_memory import error_memory
+from slamlib.robust.error_memory import error_memory, memory_of_each
 from slamlib.robust.fit import error_memories, narrow_kernels, refine
 from slamlib.robust.initialization import initial_state
 from slamlib.robust.linear import build_problem
@@ -86,6 +87,26 @@ def test_memory_is_told_and_counted():
     sentence, = (doubt.sentence for doubt in solution_doubts(result)
                  if doubt.what == "marker-memory")
     assert f"counts {len(result.share)} sightings as {result.share.sum():.0f}" in sentence
+
+
+@pytest.mark.parametrize("weak, own", [(0.0, True), (0.2, False), (0.5, False)])
+def test_an_antenna_has_its_own_memory_if_the_others_have_none(weak, own):
+    """Beside one of correlation 0.8. Correlations of 0.2 show only in three antennas together."""
+    count = 250
+    rho = np.repeat([weak, weak, weak, 0.8], count)
+    error = np.random.default_rng(3).standard_normal(4 * count)
+    for k in range(1, 4 * count):
+        error[k] = rho[k] * error[k - 1] + np.sqrt(1 - rho[k]**2) * error[k]
+    antenna, pose = np.divmod(np.arange(4 * count), count)
+    columns = antenna, pose, error[:, None], np.zeros((4 * count, 1, 1)), np.ones(4 * count, bool)
+    share = memory_of_each(*columns).share
+    expected = error_memory(*columns, adds_lack=False).share
+    if own:
+        last = antenna == 3
+        of_last = error_memory(*(column[last] for column in columns), adds_lack=False)
+        expected = np.where(last, np.append(np.ones(3 * count), of_last.share), 1)
+    assert_allclose(share, expected)
+    assert share[:-count].max() == 1 if own else share.max() < 0.7
 
 
 @pytest.mark.parametrize("seed", [1, 4])
@@ -288,6 +309,19 @@ def test_moved_markers_are_landmarks_of_their_own():
     both = estimate(dataset, previous=result)
     assert_array_equal(both.places, result.places)
     assert aligned_ate(both, truth) < 0.01
+
+
+def test_places_must_spare_independent_sightings(monkeypatch):
+    """Two for each of three new places; where errors have memory ten of the sightings are one."""
+    places = np.array([[4, 4], [4, 104], [5, 105], [5, 105], [6, 206]])
+    needed = []
+    monkeypatch.setattr(choices, "spares_sightings", lambda *args: needed.append(args[-1]))
+    for share in (1.0, 0.1):
+        accepted = SimpleNamespace(sightings=SimpleNamespace(share=np.full(5, share)))
+        fit = SimpleNamespace(problem=SimpleNamespace(accepted=accepted))
+        choices._needs_places(fit, None, places)
+    assert needed == pytest.approx([6, 60])
+    assert not choices._needs_places(None, None, places)
 
 
 def test_several_ranges_of_an_antenna_at_a_pose_have_no_lag():

@@ -154,7 +154,7 @@ def confusions(seed: int, **options) -> dict:
             initial_error = distances(state.markers, right)
             numbers[f"{kind}, {name} initial error"] = np.sqrt(np.mean(initial_error**2))
             for kernel, scales in ROUNDS.items():
-                start = narrow_kernels(problem, state, scales).state
+                start = narrow_kernels(problem, state, scales).state if scales else state
                 error = distances(optimize(last, start).state.markers, right)
                 numbers[f"{kind}, {kernel}, {name} off"] = np.mean(error > MAX_MARKER_ERROR)
     return numbers
