@@ -20,6 +20,7 @@ from numeric import (
     trials,
     true_markers,
     vehicle,
+    without_headings,
 )
 from numpy.testing import assert_allclose, assert_array_equal
 
@@ -403,6 +404,23 @@ def test_parts_of_a_drive_grow_at_most_fourfold_from_where_the_heading_is_lost()
     assert all(later <= GROWTH * end + 1 for end, later in zip(ends, ends[1:]))
     sure = Vehicle(sigma_wheelbase=1e-6, sigma_right_radius=1e-6, sigma_left_radius=1e-6)
     assert part_lengths(replace(drive, vehicle=sure)) == [len(ticks)]
+
+
+@pytest.mark.slow
+def test_parts_of_a_drive_tell_a_large_slip():
+    """3 cm after one metre; markers are points, wheels known to 3 %.
+
+    With the typical slip the wheels of each part predict the next one badly.
+    """
+    stated = Vehicle(sigma_right_radius=3e-3, sigma_left_radius=3e-3, sigma_wheelbase=1.2e-2)
+    dataset, truth = simulation.simulate("long", 2, slip=0.03, vehicle=stated, poses=9000)
+    dataset = replace(dataset, aruco=without_headings(dataset.aruco)).without("uwb")
+    result = estimate(dataset)
+    assert 0.027 < result.noise.slip < 0.033
+    assert 0.95 < result.noise.sightings < 1.05
+    assert aligned_ate(result, truth) < 0.03
+    known = measure(dataset.stating({"slip": 0.02}, "test"))
+    assert initialization.initial_state(known, "arc")[1].slip == 0.02
 
 
 def test_all_parts_of_a_drive_are_solved_one_after_the_other(monkeypatch):

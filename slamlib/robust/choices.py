@@ -99,7 +99,8 @@ VISIT_GAP = 30               # typical intervals between sightings of a marker, 
 MIN_VISIT = 3                # number of accepted sightings of a visit that is compared
 MAX_REJECTED_SHARE = 0.5     # of the sightings of a visit
 MAX_SLIP_RATIO = 2.0         # of the slips with and without an explanation that is believed
-MIN_SPARED = 2               # number of sightings, by each place of an id, or each more jump
+MIN_SPARED = 2               # number of independent sightings, by each place of an id, or of any,
+                             # by each more jump
 MAX_LOST = 0.1               # of these, number that may be rejected instead
 LOST_WEIGHT = 2              # number of these that outweigh one that is rejected instead
 PLACE_GATE = 60.0            # squared distance of x, y, heading in sigmas, beyond it another place
@@ -557,10 +558,10 @@ def most_consistent(
 
 
 def _needs_places(fit, other, places):
-    """Whether a Fit with `SlamResult.places` spares enough independent sightings, or is None.
+    """Whether a Fit with `SlamResult.places` spares enough independent sightings, not if None.
 
-    Of sightings whose errors have memory several count as one. They disagree from visit to visit,
-    of most ids, and places of each visit would spare many.
+    Several sightings whose errors have memory count as one: slow errors differ from visit to visit
+    of most ids, so that a place for each visit would spare many.
     """
     if fit is None:
         return False

@@ -20,8 +20,8 @@ lag, since the solution then takes over more than its posterior says:
     rho = mean of u u' + 1 - mean of u^2.
 
 Not so for ranges: what those of an antenna have in common is an entry of the calibration. A wall
-may stand before one antenna and not before the others: if the errors of most are independent, each
-has its own memory (`memory_of_each`). Else all have the same. The path takes over the errors of the
+may stand before one antenna and not before the others: if those of half are independent, each has
+its own memory (`memory_of_each`). Else all have the same. The path takes over the errors of the
 antenna that counts most, so that its residuals show less memory the more it counts. What is not
 used for this, such as an echo, keeps as much as the others do on average: it must not outweigh
 them.
@@ -119,12 +119,11 @@ def error_memory(landmark: np.ndarray, pose: np.ndarray, r: np.ndarray, changes:
 
 
 def memory_of_each(landmark: np.ndarray, *columns: np.ndarray) -> Memory:
-    """The Memory of all, or that of the few landmarks beside which errors are independent.
+    """One Memory of all landmarks, or one of each if those of at least half are independent.
 
-    The other `columns` are those of `error_memory`. What the mean of u^2 lacks is not added. The
-    few, at most half of the landmarks, have memories of their own, if the others have none, neither
-    one by one nor all of them together. The correlation of several memories is the most significant
-    one.
+    The other `columns` are those of `error_memory`. What the mean of u^2 lacks is not added.
+    Independent are errors that have no memory one by one nor, of these landmarks, all together. The
+    correlation of several memories is the most significant one.
     """
     columns = landmark, *columns
 
@@ -134,7 +133,8 @@ def memory_of_each(landmark: np.ndarray, *columns: np.ndarray) -> Memory:
     of_all = memory_of(slice(None))
     numbers = np.unique(landmark)
     each = [memory_of(landmark == number) for number in numbers]
-    others = [number for number, memory in zip(numbers, each) if (memory.share == 1).all()]
+    others = [number for number, memory in zip(numbers, each)
+              if (memory.share == 1).all() and memory.sigma < MIN_PAIRS**-0.5]
     if 2 * len(others) < len(each) or (memory_of(np.isin(landmark, others)).share < 1).any():
         return of_all
     share = np.empty(len(landmark))

@@ -124,10 +124,10 @@ def error_memories(problem: Problem, state: State,
 
 def narrow_kernels(
         problem: Problem, state: State, scales: Sequence[float] = CAUCHY_SCALES) -> Optimum:
-    """The last Optimum of one for each scale of the Cauchy kernel, with all measurements.
+    """The Optimum by the last of one or more scales of the Cauchy kernel, with all measurements.
 
-    The scales are in sigmas. The scatter of the residuals of each solution gives the noise of the
-    next. Raises DatasetError as `optimize`.
+    Each is solved from the one before, with the noise that the scatter of its residuals gives. The
+    scales are in sigmas. Raises DatasetError as `optimize`.
     """
     for number, scale in enumerate(scales):
         if number:                                   # the caller judges the last solution

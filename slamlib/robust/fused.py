@@ -338,7 +338,7 @@ def _odometry(dataset, jumps, start, end):
 
 
 def _filter(dataset, jumps, models):
-    """The _State of filters with these _Models after each frame."""
+    """The _State of filters with these _Models after each frame, without their markers."""
     sightings = _sightings(dataset)
     frame = sightings.frame
     odometry = _odometry(dataset, jumps, frame[:-1], frame[1:])
@@ -348,13 +348,20 @@ def _filter(dataset, jumps, models):
     variance = models.factor[:, None, None, None]**2
     state = _start(dataset.vehicle, models)
     state = _updated(state, sightings, 0, memory, variance)
-    states = [state]
+    states = [_without_markers(state)]
     for k, steps in enumerate(interval):
         Q = odometry.noise(k, models.slip)
         state = _predicted(state, odometry, k, Q, memory**steps)
         state = _updated(state, sightings, k + 1, memory, variance)
-        states.append(state)
+        states.append(_without_markers(state))
     return states
+
+
+def _without_markers(state):
+    """The _State of pose and shared parameters alone, which needs less memory."""
+    return state._replace(
+        x=state.x[:, :3].copy(), P=state.P[:, :9, :9].copy(), marker=state.marker[:0],
+        row=state.row[:0], z=state.z[:0])
 
 
 def _start(vehicle, models):

@@ -22,13 +22,13 @@ from slamlib.robust.calibration import ANTENNAS, HEIGHT, OFFSET, SCALE, SIGHTING
 from slamlib.robust.factors import MIN_DISTANCE, sensor_poses
 from slamlib.robust.fit import CAUCHY_SCALES, narrow_kernels
 from slamlib.robust.linear import State, build_problem, state_from_arrays
-from slamlib.robust.measurements import Measurements, Noise, measure
+from slamlib.robust.measurements import Measurements, Noise, measure, with_known
 from slamlib.robust.noise import learn_noise
 from slamlib.robust.optimize import cauchy_minimum
 
-MAX_ODOMETRY_SIGMA = 0.5     # rad, of odometry's heading at the end of a drive's first part
-MAX_FIRST_PART = 1.5         # length of the first part over that which odometry can predict, and
-                             # least ratio of the numbers of poses of two parts
+MAX_ODOMETRY_SIGMA = 0.5     # rad, of odometry's heading at the end of a part
+MAX_FIRST_PART = 1.5         # length of the first part over that which odometry can predict
+MIN_GROWTH = 1.5             # least ratio to which slip limits a part and the one before
 GROWTH = 4                   # largest ratio of the numbers of poses of a part and the one before
 
 MAX_RANGES = 150             # maximum number of ranges used per antenna, evenly chosen
@@ -46,15 +46,15 @@ MIN_FITTING = 0.5            # share of contradicting ranges that fit one other 
 def initial_state(measurements: Measurements, model: str) -> tuple[State, Noise]:
     """The State from which a drive is solved, by odometry of the model "arc" or "euler".
 
-    And the Noise with the slip that a long drive's parts tell, else the typical one. Raises
-    DatasetError as `optimize`, for the first part of a long drive.
+    And the Noise with the slip that is known, or that a long drive's parts tell, else the typical
+    one. Raises DatasetError as `optimize`, for the first part of a long drive.
     """
     dataset = measurements.dataset
     frame = measurements.frame
     lengths = part_lengths(dataset)
     part = None
     state = None
-    noise = Noise()
+    noise = with_known(Noise(), dataset.vehicle)
     count = lengths[0]
     while count < len(dataset.ticks):
         longer = measure(dataset.first(count), frame[frame < count], measurements.jumps)
@@ -62,8 +62,9 @@ def initial_state(measurements: Measurements, model: str) -> tuple[State, Noise]
         optimum = narrow_kernels(build_problem(longer, model, noise), state)
         if longer.learned[0]:
             noise = Noise(learn_noise(optimum.equations).noise.slip)
+            scattered = optimum.equations.problem.noise._replace(slip=noise.slip)
             optimum = narrow_kernels(
-                build_problem(longer, model, noise), optimum.state, CAUCHY_SCALES[-1:])
+                build_problem(longer, model, scattered), optimum.state, CAUCHY_SCALES[-1:])
         state = optimum.state
         part = longer
         planned = next(length for length in lengths if length > count)
@@ -72,7 +73,7 @@ def initial_state(measurements: Measurements, model: str) -> tuple[State, Noise]
 
 
 def part_lengths(dataset: Dataset) -> list[int]:
-    """Numbers of encoder poses of the parts of a drive, which all start at pose 1.
+    """Largest numbers of encoder poses of the parts of a drive, which all start at pose 1.
 
     Each part is at most GROWTH times as long as the one before; the last one is the whole drive.
     """
@@ -93,13 +94,13 @@ def part_lengths(dataset: Dataset) -> list[int]:
 def _predictable(dataset, count, slip):
     """Number of poses of the part after one with `count`, whose headings odometry can predict.
 
-    With a slip in sqrt(m). At least MAX_FIRST_PART times as many poses.
+    With a slip in sqrt(m). At least MIN_GROWTH times as many poses.
     """
     vehicle = dataset.vehicle
     travel = np.abs(dataset.ticks[count:] * vehicle.metres_per_count).sum(axis=1)
     variance = np.cumsum(slip**2 * travel) / vehicle.wheelbase**2        # of the heading
     predicted = count + np.searchsorted(variance, MAX_ODOMETRY_SIGMA**2)
-    return max(int(predicted), int(MAX_FIRST_PART * count))
+    return max(int(predicted), int(MIN_GROWTH * count))
 
 
 def odometry_state(measurements: Measurements, model: str, part: Measurements | None = None,
