@@ -267,6 +267,17 @@ def test_slow_errors_of_the_sightings_are_counted_once(memory, missed, most):
     assert off < most and 1.5 < ratio < 5
 
 
+def test_a_camera_that_is_turned_is_found_where_stretches_do_not_show_it():
+    """The first 20 images of each tenth of the drive are so blurred that they tell nothing."""
+    dataset = short(4, path="long")[0]
+    frame, number = np.unique(dataset.aruco.pose, return_inverse=True)
+    blurred = number % (len(frame) // 10) < 20
+    factor = np.where(blurred, 1e4, 1.0)[:, None, None]
+    turned = seen_from(dataset, camera=(0.0, 0.0, 0.05))
+    fused = fuse(aruco(turned, covariance=factor * turned.aruco.covariance))
+    assert_allclose(fused.camera[2], 0.05, atol=0.01)
+
+
 def test_a_camera_that_is_turned_is_found():
     """By 0.08 rad, as vehicle.toml does not state it; nothing is found where it is as stated."""
     dataset, truth = short(3, 1000)
