@@ -99,8 +99,8 @@ VISIT_GAP = 30               # typical intervals between sightings of a marker, 
 MIN_VISIT = 3                # number of accepted sightings of a visit that is compared
 MAX_REJECTED_SHARE = 0.5     # of the sightings of a visit
 MAX_SLIP_RATIO = 2.0         # of the slips with and without an explanation that is believed
-MIN_SPARED = 2               # number of independent sightings, by each place of an id, or of any,
-                             # by each more jump
+MIN_SPARED = 2               # number of sightings, by each more jump, or by each place of an id if
+                             # their errors are independent
 MAX_LOST = 0.1               # of these, number that may be rejected instead
 LOST_WEIGHT = 2              # number of these that outweigh one that is rejected instead
 PLACE_GATE = 60.0            # squared distance of x, y, heading in sigmas, beyond it another place

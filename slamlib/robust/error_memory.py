@@ -20,10 +20,10 @@ lag, since the solution then takes over more than its posterior says:
     rho = mean of u u' + 1 - mean of u^2.
 
 Not so for ranges: what those of an antenna have in common is an entry of the calibration. A wall
-may stand before one antenna and not before the others: if those of half are independent, each has
-its own memory (`memory_of_each`). Else all have the same. The path takes over the errors of the
-antenna that counts most, so that its residuals show less memory the more it counts. What is not
-used for this, such as an echo, keeps as much as the others do on average: it must not outweigh
+may stand before one antenna and not before the others: if those of at least half are independent,
+each has its own memory (`memory_of_each`). Else all have the same. The path takes over the errors
+of the antenna that counts most, so that its residuals show less memory the more it counts. What is
+not used for this, such as an echo, keeps as much as the others do on average: it must not outweigh
 them.
 
 After a break the sensor sees the landmark from elsewhere, with another error.

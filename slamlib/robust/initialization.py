@@ -28,7 +28,7 @@ from slamlib.robust.optimize import cauchy_minimum
 
 MAX_ODOMETRY_SIGMA = 0.5     # rad, of odometry's heading at the end of a part
 MAX_FIRST_PART = 1.5         # length of the first part over that which odometry can predict
-MIN_GROWTH = 1.5             # least ratio to which slip limits a part and the one before
+MIN_GROWTH = 1.5             # least ratio of a part that the slip shortens to the one before
 GROWTH = 4                   # largest ratio of the numbers of poses of a part and the one before
 
 MAX_RANGES = 150             # maximum number of ranges used per antenna, evenly chosen
@@ -92,9 +92,9 @@ def part_lengths(dataset: Dataset) -> list[int]:
 
 
 def _predictable(dataset, count, slip):
-    """Number of poses of the part after one with `count`, whose headings odometry can predict.
+    """Number of poses up to which odometry with a slip, sqrt(m), predicts headings after `count`.
 
-    With a slip in sqrt(m). At least MIN_GROWTH times as many poses.
+    It is at least MIN_GROWTH times `count`.
     """
     vehicle = dataset.vehicle
     travel = np.abs(dataset.ticks[count:] * vehicle.metres_per_count).sum(axis=1)
