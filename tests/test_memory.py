@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from conftest import ROOT
-from numeric import aligned_ate, aruco, mean_nees, short, sightings, uwb, vehicle
+from numeric import aligned_ate, aruco, mean_nees, short, sightings, uwb, vehicle, without_headings
 from numpy.testing import assert_allclose, assert_array_equal
 
 from slamlib import estimate
@@ -16,13 +16,20 @@ from slamlib.core.vehicle import TABLE_2
 from slamlib.robust import choices
 from slamlib.robust.choices import SMALL_SLIP, _squared_distance, visits
 from slamlib.robust.error_memory import error_memory, memory_of_each
-from slamlib.robust.fit import error_memories, narrow_kernels, refine
+from slamlib.robust.fit import (
+    error_memories,
+    narrow_kernels,
+    refine,
+    refine_without_memory,
+    turns_by_slip,
+)
 from slamlib.robust.initialization import initial_state
 from slamlib.robust.linear import build_problem
 from slamlib.robust.measurements import Noise, measure
 from slamlib.robust.noise import with_least_slip
 from slamlib.robust.solution_doubts import solution_doubts
 from slamlib.studies.montecarlo import antenna_error
+from slamlib.studies.simulation import simulate
 
 LANDMARKS, EACH = 40, 10
 
@@ -201,6 +208,32 @@ def test_a_large_slip_is_no_error_of_a_sensor():
     assert found.noise.sightings == pytest.approx(1, abs=0.1)
     assert found.slip == pytest.approx(0.03, rel=0.2)
     assert aligned_ate(found, truth) < 0.008     # 0.08 by memory
+
+
+@pytest.mark.parametrize("options, shake, turns", [
+    ({"slip": 0.03}, 0.0, True), ({"slip": 0.005}, 0.0, True), ({}, 0.03, False)])
+def test_slip_turns_the_vehicle_and_a_shaking_camera_does_not(options, shake, turns):
+    dataset = shaken(short(1, **options)[0].without("uwb"), shake, poses=30)
+    measurements = measure(dataset)
+    problem = build_problem(measurements, "arc")
+    state = narrow_kernels(problem, initial_state(measurements, "arc")[0]).state
+    by_slip = refine_without_memory(problem, state)
+    assert by_slip.problem.noise.slip > 0.004
+    assert turns_by_slip(by_slip.problem, by_slip.state) == turns
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("headings", [True, False])
+def test_a_slip_of_centimetres_is_believed_where_it_predicts_badly(headings):
+    """Half a lap of the long path: 1.4 m with 2 mm of slip and sightings ten times as noisy."""
+    dataset, truth = simulate("long", 1, slip=0.03)
+    dataset = dataset.without("uwb").first(6000)
+    if not headings:
+        dataset = replace(dataset, aruco=without_headings(dataset.aruco))
+    found = estimate(dataset)
+    assert found.slip == pytest.approx(0.03, rel=0.05)
+    assert found.noise.sightings == pytest.approx(1, abs=0.05)
+    assert ate(found.poses, truth.poses[:6000], aligned=True) < 0.5
 
 
 def test_covariances_are_honest():

@@ -38,7 +38,6 @@ from slamlib.robust.calibration import RADII, WHEEL_SCALE, WHEELS, Prior
 from slamlib.robust.error_memory import runs
 from slamlib.robust.factors import odometry_error, preintegrate_odometry
 from slamlib.robust.fit import (
-    ROUGH,
     Fit,
     accepted_measurements,
     has_memory,
@@ -47,11 +46,11 @@ from slamlib.robust.fit import (
     refine_without_memory,
     relinearized,
     residuals,
+    turns_by_slip,
 )
 from slamlib.robust.jumps import (
     UNKNOWN_SIGMA,
     Jumps,
-    cauchy_cost,
     find_jumps,
     most_together,
     with_overlooked,
@@ -63,8 +62,7 @@ from slamlib.robust.linear import (
     laplace_approximation,
     linear_solution,
 )
-from slamlib.robust.measurements import AcceptedMeasurements, Noise
-from slamlib.robust.optimize import optimize
+from slamlib.robust.measurements import AcceptedMeasurements
 from slamlib.robust.part_faults import camera_bump
 from slamlib.robust.result import slam_result
 
@@ -88,11 +86,8 @@ MIN_JUMP_LEAD = 10.0         # log evidence by which a jump found at the solutio
 MIN_REJECTED = 3             # number of sightings together, near which a jump may be overlooked
 
 SMALL_SLIP = 2e-3            # sqrt(m), above which slow errors of sensors may be the cause
-LARGE_SLIP = 0.01            # sqrt(m), above which errors of sensors mostly are
+LARGE_SLIP = 0.01            # sqrt(m), above which errors of images may be the cause
 AS_STATED = 1.25             # ratio of sigmas, within which errors are as large as stated
-BLOCKS = 12                  # parts of the drive, of which every second one is predicted
-BETTER = 1.15                # ratio of mean costs of predictions, by which a slip is believed
-FAR_BETTER = 1.5             # the same, of a large slip
 MIN_OVER_ROUNDING = 4.0      # ratio of variances of a slip and of the rounding of counts
 
 VISIT_GAP = 30               # typical intervals between sightings of a marker, that end a visit
@@ -111,36 +106,36 @@ def memory_or_slip(problem: Problem, state: State) -> Fit:
     """The Fit of a Problem, near its solution, that explains slow errors by memory, or by slip.
 
     Slow errors of sensors bend the path as slip does. A learned slip explains them if errors are
-    independent then; unless it is small, they must be as large as stated, too. Where it is not
-    small the errors may be slow all the same: the slip is believed only if it predicts better, and
-    a large one far better. Where wheels slip, memory first finds the slip, too; where they are
-    wrongly stated, it may find slow errors instead.
+    independent then. Unless it is small, they must be as large as stated, and it must turn the
+    vehicle. Otherwise memory comes first: where wheels slip, it finds the slip, too.
 
-    Errors that all markers of an image share, as of its time, look like a large slip, too. So a
-    large slip must predict better than a small one with larger errors of the sightings. These are
-    not compared where the rounding of coarse counts looks like this slip.
+    Errors that all markers of an image share, as of its time, look like slip, too, often a large
+    one. Where a slip that memory finds, or a large one, does not turn the vehicle, it is held small
+    and the sightings have larger errors instead.
     """
     by_slip = refine_without_memory(replace(problem, memory_first=False), state)
     slip, *factors = by_slip.problem.noise
-    is_small = slip < SMALL_SLIP or not problem.measurements.learned[0]
     is_as_stated = np.abs(np.log(factors)).max() < np.log(AS_STATED)
-    explains = (is_small or is_as_stated) and not has_memory(by_slip)
-    if explains and is_small:
+    explains = (_is_small_slip(by_slip) or is_as_stated) and not has_memory(by_slip)
+    if explains and _is_slip(by_slip):
         return by_slip
-    memory_first = replace(problem, memory_first=True)
-    found = by_slip if explains else refine(memory_first, state)
-    is_large = problem.measurements.learned[0] and found.problem.noise.slip >= LARGE_SLIP
-    if is_large and not _is_rounding(found):
-        by_images = if_solvable(refine, replace(problem, max_slip=SMALL_SLIP), state)
-        if by_images is not None and not _predicts_better(found, by_images, 1.0):
-            return by_images
-    if not explains:
-        return found
-    by_memory = if_solvable(refine, memory_first, state)
-    if by_memory is None or (by_memory.problem.accepted.share == 1).all():
-        return by_slip
-    needed = FAR_BETTER if is_large else BETTER
-    return by_slip if _predicts_better(by_slip, by_memory, needed) else by_memory
+    fit = by_slip
+    if not explains or slip < LARGE_SLIP:
+        fit = if_solvable(refine, replace(problem, memory_first=True), state) or by_slip
+    if not _is_slip(fit):
+        fit = if_solvable(refine, replace(problem, max_slip=SMALL_SLIP), state) or fit
+    return fit
+
+
+def _is_slip(fit):
+    """Whether the slip of a Fit is small, turns the vehicle, or may be the rounding of counts."""
+    return (_is_small_slip(fit) or _is_rounding(fit)
+            or turns_by_slip(fit.problem, fit.state))
+
+
+def _is_small_slip(fit):
+    """Whether the slip of a Fit is small, or known."""
+    return fit.problem.noise.slip < SMALL_SLIP or not fit.problem.measurements.learned[0]
 
 
 def _is_rounding(fit):
@@ -150,41 +145,6 @@ def _is_rounding(fit):
     variance = fit.problem.noise.slip**2 * np.median(along)
     rounding = m.dataset.vehicle.metres_per_count.max()**2 / 6       # of a difference of two
     return variance < MIN_OVER_ROUNDING * rounding
-
-
-def _predicts_better(by_slip, other, needed):
-    """Whether a Fit by a slip predicts measurements better than another one, by a ratio."""
-    cost = _prediction_cost(by_slip)
-    cost_of_other = _prediction_cost(other)
-    log.info("prediction: cost %.3g by a slip of %.3g mm after 1 m, %.3g by %.3g mm", cost,
-             1e3 * by_slip.problem.noise.slip, cost_of_other, 1e3 * other.problem.noise.slip)
-    return needed * cost < cost_of_other
-
-
-def _prediction_cost(fit):
-    """Mean robust cost, in stated sigmas, of measurements that a Fit predicts without them.
-
-    Of BLOCKS parts of the drive every second one is left out, then the others (cross-validation).
-    Measurements of landmarks that are measured only there are not predicted.
-    """
-    m = fit.problem.measurements
-    block = np.arange(len(m.frame)) * BLOCKS // len(m.frame)
-    of_kinds = (m.sightings.row, m.marker_row), (m.ranges.row, m.ranges.antenna)
-    squared = []
-    for parity in (0, 1):
-        accepted = []
-        predicted = []
-        for kind, (row, landmark) in zip(fit.problem.accepted, of_kinds):
-            left_out = block[row] % 2 == parity
-            rest = np.where(left_out, 0.0, kind.weight)
-            accepted.append(replace(kind, weight=rest))
-            predicted.append(left_out & np.isin(landmark, landmark[rest > 0]))
-        problem = replace(fit.problem, accepted=AcceptedMeasurements(*accepted))
-        state = optimize(problem, fit.state, tolerance=ROUGH).state
-        sightings, ranges = residuals(replace(problem, noise=Noise()), state)
-        squared += [np.sum(sightings[predicted[0]]**2, axis=1), ranges[predicted[1]]**2]
-    costs = cauchy_cost(np.concatenate(squared))
-    return costs.sum() / max(len(costs), 1)
 
 
 def better_model(fit: Fit) -> Fit:

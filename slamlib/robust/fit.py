@@ -18,7 +18,11 @@ from slamlib.core.kernels import KERNELS, ONE_SIDED_BIAS
 from slamlib.core.sightings import GATE, MEDIAN_CHI2, POINT_GATE
 from slamlib.robust.calibration import RANGE_LAG, SIGHTING_LAG, WHEELS
 from slamlib.robust.error_memory import Memory, error_memory, memory_of_each
-from slamlib.robust.factors import linearize_measurements, preintegrate_odometry
+from slamlib.robust.factors import (
+    linearize_measurements,
+    linearize_odometry,
+    preintegrate_odometry,
+)
 from slamlib.robust.linear import (
     NormalEquations,
     Problem,
@@ -46,6 +50,8 @@ CAUCHY_SCALES = (10.0, 3.0)   # sigmas, scale of the kernel in each round
 ROUGH = 1e-4                 # relative decrease of the error at which a round ends
 MIN_RESIDUALS = 20           # number of measurements from which their scatter gives a factor
 
+TURNS_TOGETHER = 10          # number of increments whose errors of heading are added
+MIN_WANDERING = 0.5          # ratio of variances, of headings that wander as by slip
 DRAWS = 8                    # number of draws from the posterior, for products of errors
 MAX_ROUNDS = 20              # number of rounds of wheels, noise and accepted measurements
 FREE_ROUNDS = 12             # of these, after which the shares of memory only fall
@@ -120,6 +126,32 @@ def error_memories(problem: Problem, state: State,
         m.ranges.antenna, m.frame[m.ranges.row], ranges.e, changes[1],
         is_direct & (accepted.ranges.weight > 0))
     return of_sightings, of_ranges
+
+
+def turns_by_slip(problem: Problem, state: State) -> bool:
+    """Whether the heading wanders from odometry as by a slip of this size.
+
+    Errors of turns that slip explains are independent: the variance of their sum over
+    TURNS_TOGETHER increments is the sum of their variances. What is no slip turns the path ahead
+    and back, and the ratio of both is small (variance ratio: Lo and MacKinlay, Review of Financial
+    Studies 1(1), 1988). By the posterior of a Problem at its solution. Raises DatasetError as
+    `posterior_draws`.
+    """
+    steps = posterior_draws(NormalEquations(problem, state), DRAWS)
+    factors = linearize_odometry(problem, state, problem.noise.slip)
+    changes = errors_after(factors, problem.measurements.structure, steps)[:, 2]
+    errors = np.column_stack([factors.e[:, 2], changes / np.sqrt(DRAWS)])     # of the headings
+    count = len(errors)
+    q = TURNS_TOGETHER
+    if count < q:
+        return True
+    added = np.cumulative_sum(errors, axis=0, include_initial=True)
+    together = added[q:] - added[:-q]
+    ratio = np.mean(np.sum(together**2, axis=1)) / np.mean(np.sum(errors**2, axis=1)) / q
+    sigma = np.sqrt(2 * (2 * q - 1) * (q - 1) / (3 * q * count))
+    log.info("slip %.3g mm after 1 m: headings wander %.2f ± %.2f times as much",
+             1e3 * problem.noise.slip, ratio, sigma)
+    return bool(ratio > min(MIN_WANDERING, 1 - 2 * sigma))
 
 
 def narrow_kernels(
