@@ -404,6 +404,9 @@ def test_parts_of_a_drive_grow_at_most_fourfold_from_where_the_heading_is_lost()
     assert all(later <= GROWTH * end + 1 for end, later in zip(ends, ends[1:]))
     sure = Vehicle(sigma_wheelbase=1e-6, sigma_right_radius=1e-6, sigma_left_radius=1e-6)
     assert part_lengths(replace(drive, vehicle=sure)) == [len(ticks)]
+    ends = part_lengths(replace(drive, vehicle=sure), slip=0.03)
+    metres = 0.5**2 / (2 * 0.03**2 / 0.4**2)         # where both wheels' slip has turned it by 0.5
+    assert ends[0] == pytest.approx(len(ticks) * metres / 300, rel=0.02)
 
 
 @pytest.mark.slow
@@ -431,7 +434,7 @@ def test_all_parts_of_a_drive_are_solved_one_after_the_other(monkeypatch):
         solved.append(len(problem.measurements.dataset.ticks))
         return optimize(problem, state, max_steps=1)
 
-    monkeypatch.setattr(initialization, "part_lengths", lambda _: [200, 400, 600])
+    monkeypatch.setattr(initialization, "part_lengths", lambda *_: [200, 400, 600])
     monkeypatch.setattr(initialization, "narrow_kernels", narrow_kernels)
     initialization.initial_state(measure(short(4, 600)[0]), "arc")
     assert solved == [200, 200, 400, 400]

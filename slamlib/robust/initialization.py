@@ -16,6 +16,7 @@ import numpy as np
 
 from slamlib.core import odometry, se2
 from slamlib.core.graph import GUESS_PRIOR_SIGMA
+from slamlib.core.increments import TYPICAL_SLIP
 from slamlib.core.records import Dataset
 from slamlib.core.sightings import consensus
 from slamlib.robust.calibration import ANTENNAS, HEIGHT, OFFSET, SCALE, SIGHTING_LAG, SIZE, WHEELS
@@ -43,18 +44,19 @@ MIN_TOO_SHORT = 0.2          # share of contradicting ranges; without line of si
 MIN_FITTING = 0.5            # share of contradicting ranges that fit one other position
 
 
-def initial_state(measurements: Measurements, model: str) -> tuple[State, Noise]:
+def initial_state(measurements: Measurements, model: str,
+                  slip: float = TYPICAL_SLIP) -> tuple[State, Noise]:
     """The State from which a drive is solved, by odometry of the model "arc" or "euler".
 
-    And the Noise with the slip that is known, or that a long drive's parts tell, else the typical
-    one. Raises DatasetError as `optimize`, for the first part of a long drive.
+    And the Noise with the slip that is known, or that a long drive's parts tell, else the one that
+    is given, sqrt(m). Raises DatasetError as `optimize`, for the first part of a long drive.
     """
     dataset = measurements.dataset
     frame = measurements.frame
-    lengths = part_lengths(dataset)
+    noise = with_known(Noise(slip), dataset.vehicle)
+    lengths = part_lengths(dataset, noise.slip)
     part = None
     state = None
-    noise = with_known(Noise(), dataset.vehicle)
     count = lengths[0]
     while count < len(dataset.ticks):
         longer = measure(dataset.first(count), frame[frame < count], measurements.jumps)
@@ -72,14 +74,15 @@ def initial_state(measurements: Measurements, model: str) -> tuple[State, Noise]
     return odometry_state(measurements, model, part, state), noise
 
 
-def part_lengths(dataset: Dataset) -> list[int]:
+def part_lengths(dataset: Dataset, slip: float = TYPICAL_SLIP) -> list[int]:
     """Largest numbers of encoder poses of the parts of a drive, which all start at pose 1.
 
-    Each part is at most GROWTH times as long as the one before; the last one is the whole drive.
+    Odometry with this slip, sqrt(m), predicts the headings of the first one. Each part is at most
+    GROWTH times as long as the one before; the last one is the whole drive.
     """
-    covariances = odometry.first_order(
-        dataset.ticks, dataset.vehicle, initial_covariance=np.zeros((3, 3)))[1]
-    lost = np.flatnonzero(covariances[:, 2, 2] > MAX_ODOMETRY_SIGMA**2)
+    by_wheels = odometry.first_order(
+        dataset.ticks, dataset.vehicle, initial_covariance=np.zeros((3, 3)))[1][:, 2, 2]
+    lost = np.flatnonzero(by_wheels + _by_slip(dataset, slip) > MAX_ODOMETRY_SIGMA**2)
     length = len(dataset.ticks)
     lengths = [length]
     if not len(lost):
@@ -96,11 +99,16 @@ def _predictable(dataset, count, slip):
 
     It is at least MIN_GROWTH times `count`.
     """
-    vehicle = dataset.vehicle
-    travel = np.abs(dataset.ticks[count:] * vehicle.metres_per_count).sum(axis=1)
-    variance = np.cumsum(slip**2 * travel) / vehicle.wheelbase**2        # of the heading
-    predicted = count + np.searchsorted(variance, MAX_ODOMETRY_SIGMA**2)
+    variance = _by_slip(dataset, slip)
+    predicted = np.searchsorted(variance, variance[count - 1] + MAX_ODOMETRY_SIGMA**2)
     return max(int(predicted), int(MIN_GROWTH * count))
+
+
+def _by_slip(dataset, slip):
+    """Variance (n,) of the headings by odometry, from a slip in sqrt(m)."""
+    vehicle = dataset.vehicle
+    travel = np.abs(dataset.ticks * vehicle.metres_per_count).sum(axis=1)
+    return np.cumsum(slip**2 * travel) / vehicle.wheelbase**2
 
 
 def odometry_state(measurements: Measurements, model: str, part: Measurements | None = None,

@@ -11,15 +11,18 @@ from dataclasses import replace
 
 import numpy as np
 
-from slamlib.core.errors import require
+from slamlib.core.errors import if_solvable, require
 from slamlib.core.graph import require_rows
+from slamlib.core.increments import TYPICAL_SLIP
 from slamlib.core.odometry import MODELS
 from slamlib.core.records import Dataset
 from slamlib.robust.choices import (
+    LARGE_SLIP,
     better_model,
     calibrated,
     memory_or_slip,
     most_consistent,
+    spares_sightings,
 )
 from slamlib.robust.fit import Fit, narrow_kernels, refine_like, settled
 from slamlib.robust.initialization import initial_state, state_from_poses
@@ -135,13 +138,22 @@ def fit_from_odometry(measurements: Measurements, model: str = "arc",
     """
     if like is not None:
         model = like.problem.odometry.model
-    state, noise = initial_state(measurements, model)                                 # 4
-    state = narrow_kernels(build_problem(measurements, model, noise), state).state    # 5
+
+    def solved_with(slip):
+        state, noise = initial_state(measurements, model, slip)                       # 4
+        return narrow_kernels(build_problem(measurements, model, noise), state).state       # 5
+
     problem = build_problem(measurements, model)                                      # 2
-    if like is None:                                                                  # 6
-        return memory_or_slip(problem, state)
-    problem = _with_decisions(problem, like.problem)
-    return refine_like(problem, replace(state, c=like.state.c), like)
+    if like is not None:
+        problem = _with_decisions(problem, like.problem)
+        state = solved_with(like.problem.noise.slip)
+        return refine_like(problem, replace(state, c=like.state.c), like)
+    fit = memory_or_slip(problem, solved_with(TYPICAL_SLIP))                          # 6
+    slip = fit.problem.noise.slip
+    if slip < LARGE_SLIP or not measurements.learned[0]:
+        return fit
+    again = if_solvable(lambda: memory_or_slip(problem, solved_with(slip)))
+    return again if spares_sightings(again, fit, "a start with this slip", 1) else fit
 
 
 def _with_decisions(problem, decided):
