@@ -52,6 +52,7 @@ MIN_RESIDUALS = 20           # number of measurements from which their scatter g
 
 TURNS_TOGETHER = 10          # number of increments whose errors of heading are added
 MIN_WANDERING = 0.5          # ratio of variances, of headings that wander as by slip
+MIN_TOLD = 0.1               # share of these variances that measurements tell
 DRAWS = 8                    # number of draws from the posterior, for products of errors
 MAX_ROUNDS = 20              # number of rounds of wheels, noise and accepted measurements
 FREE_ROUNDS = 12             # of these, after which the shares of memory only fall
@@ -129,7 +130,7 @@ def error_memories(problem: Problem, state: State,
 
 
 def turns_by_slip(problem: Problem, state: State) -> bool:
-    """Whether the heading wanders from odometry as by a slip of this size.
+    """Whether measurements tell that the heading wanders from odometry as by a slip of this size.
 
     Errors of turns that slip explains are independent: the variance of their sum over
     TURNS_TOGETHER increments is the sum of their variances. What is no slip turns the path ahead
@@ -146,12 +147,14 @@ def turns_by_slip(problem: Problem, state: State) -> bool:
     if count < q:
         return True
     added = np.cumulative_sum(errors, axis=0, include_initial=True)
-    together = added[q:] - added[:-q]
-    ratio = np.mean(np.sum(together**2, axis=1)) / np.mean(np.sum(errors**2, axis=1)) / q
+    of_sums = np.mean((added[q:] - added[:-q])**2, axis=0) / q
+    of_each = np.mean(errors**2, axis=0).sum()
+    ratio = of_sums.sum() / of_each
+    told = 1 - of_sums[1:].sum() / of_each               # by the measurements
     sigma = np.sqrt(2 * (2 * q - 1) * (q - 1) / (3 * q * count))
-    log.info("slip %.3g mm after 1 m: headings wander %.2f ± %.2f times as much",
-             1e3 * problem.noise.slip, ratio, sigma)
-    return bool(ratio > min(MIN_WANDERING, 1 - 2 * sigma))
+    log.info("slip %.3g mm after 1 m: headings wander %.2f ± %.2f times as much, share told %.2f",
+             1e3 * problem.noise.slip, ratio, sigma, told)
+    return bool(told > MIN_TOLD and ratio > min(MIN_WANDERING, 1 - 2 * sigma))
 
 
 def narrow_kernels(
