@@ -128,9 +128,14 @@ def memory_or_slip(problem: Problem, state: State) -> Fit:
 
 
 def _is_slip(fit):
-    """Whether the slip of a Fit is small, turns the vehicle, or may be the rounding of counts."""
-    return (_is_small_slip(fit) or _is_rounding(fit)
-            or turns_by_slip(fit.problem, fit.state))
+    """Whether the slip of a Fit is small, turns the vehicle, or may be the rounding of counts.
+
+    Where headings do not tell, a large one is none.
+    """
+    if _is_small_slip(fit) or _is_rounding(fit):
+        return True
+    turns = turns_by_slip(fit.problem, fit.state)
+    return fit.problem.noise.slip < LARGE_SLIP if turns is None else turns
 
 
 def _is_small_slip(fit):

@@ -129,13 +129,13 @@ def error_memories(problem: Problem, state: State,
     return of_sightings, of_ranges
 
 
-def turns_by_slip(problem: Problem, state: State) -> bool:
-    """Whether measurements tell that the heading wanders from odometry as by a slip of this size.
+def turns_by_slip(problem: Problem, state: State) -> bool | None:
+    """Whether the heading wanders from odometry as by a slip of this size, None if unknown.
 
     Errors of turns that slip explains are independent: the variance of their sum over
     TURNS_TOGETHER increments is the sum of their variances. What is no slip turns the path ahead
     and back, and the ratio of both is small (variance ratio: Lo and MacKinlay, Review of Financial
-    Studies 1(1), 1988). By the posterior of a Problem at its solution. Raises DatasetError as
+    Studies 1(1), 1988). Unknown are headings that the measurements hardly tell. By the posterior of a Problem at its solution. Raises DatasetError as
     `posterior_draws`.
     """
     steps = posterior_draws(NormalEquations(problem, state), DRAWS)
@@ -145,7 +145,7 @@ def turns_by_slip(problem: Problem, state: State) -> bool:
     count = len(errors)
     q = TURNS_TOGETHER
     if count < q:
-        return True
+        return None
     added = np.cumulative_sum(errors, axis=0, include_initial=True)
     of_sums = np.mean((added[q:] - added[:-q])**2, axis=0) / q
     of_each = np.mean(errors**2, axis=0).sum()
@@ -154,7 +154,9 @@ def turns_by_slip(problem: Problem, state: State) -> bool:
     sigma = np.sqrt(2 * (2 * q - 1) * (q - 1) / (3 * q * count))
     log.info("slip %.3g mm after 1 m: headings wander %.2f ± %.2f times as much, share told %.2f",
              1e3 * problem.noise.slip, ratio, sigma, told)
-    return bool(told > MIN_TOLD and ratio > min(MIN_WANDERING, 1 - 2 * sigma))
+    if told < MIN_TOLD:
+        return None
+    return bool(ratio > min(MIN_WANDERING, 1 - 2 * sigma))
 
 
 def narrow_kernels(
