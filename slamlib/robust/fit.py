@@ -135,8 +135,8 @@ def turns_by_slip(problem: Problem, state: State) -> bool | None:
     Errors of turns that slip explains are independent: the variance of their sum over
     TURNS_TOGETHER increments is the sum of their variances. What is no slip turns the path ahead
     and back, and the ratio of both is small (variance ratio: Lo and MacKinlay, Review of Financial
-    Studies 1(1), 1988). Unknown are headings that the measurements hardly tell. By the posterior of a Problem at its solution. Raises DatasetError as
-    `posterior_draws`.
+    Studies 1(1), 1988). Headings that are hardly measured tell nothing of it. By the posterior of a
+    Problem at its solution. Raises DatasetError as `posterior_draws`.
     """
     steps = posterior_draws(NormalEquations(problem, state), DRAWS)
     factors = linearize_odometry(problem, state, problem.noise.slip)
