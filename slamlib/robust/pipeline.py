@@ -150,7 +150,8 @@ def fit_from_odometry(measurements: Measurements, model: str = "arc",
         return refine_like(problem, replace(state, c=like.state.c), like)
     fit = memory_or_slip(problem, solved_with(TYPICAL_SLIP))                          # 6
     slip = fit.problem.noise.slip
-    if slip < LARGE_SLIP or not measurements.learned[0]:
+    all_accepted = fit.problem.accepted.sightings.weight.all()
+    if slip < LARGE_SLIP or not measurements.learned[0] or all_accepted:
         return fit
     again = if_solvable(lambda: memory_or_slip(problem, solved_with(slip)))
     return again if spares_sightings(again, fit, "a start with this slip", 1) else fit
