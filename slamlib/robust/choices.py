@@ -86,7 +86,7 @@ MIN_JUMP_LEAD = 10.0         # log evidence by which a jump found at the solutio
 MIN_REJECTED = 3             # number of sightings together, near which a jump may be overlooked
 
 SMALL_SLIP = 2e-3            # sqrt(m), above which slow errors of sensors may be the cause
-LARGE_SLIP = 0.01            # sqrt(m), above which errors of images may be the cause
+LARGE_SLIP = 0.01            # sqrt(m), above which errors of images mostly are, if it is none
 AS_STATED = 1.25             # ratio of sigmas, within which errors are as large as stated
 MIN_OVER_ROUNDING = 4.0      # ratio of variances of a slip and of the rounding of counts
 
@@ -106,8 +106,9 @@ def memory_or_slip(problem: Problem, state: State) -> Fit:
     """The Fit of a Problem, near its solution, that explains slow errors by memory, or by slip.
 
     Slow errors of sensors bend the path as slip does. A learned slip explains them if errors are
-    independent then. Unless it is small, they must be as large as stated, and it must turn the
-    vehicle. Otherwise memory comes first: where wheels slip, it finds the slip, too.
+    independent then. Unless it is small, they must be as large as stated, too, and it must turn the
+    vehicle, if headings tell. Otherwise memory comes first: where wheels slip, it finds the slip,
+    too.
 
     Errors that all markers of an image share, as of its time, look like slip, too, often a large
     one. Where a slip that memory finds, or a large one, does not turn the vehicle, it is held small
@@ -117,25 +118,25 @@ def memory_or_slip(problem: Problem, state: State) -> Fit:
     slip, *factors = by_slip.problem.noise
     is_as_stated = np.abs(np.log(factors)).max() < np.log(AS_STATED)
     explains = (_is_small_slip(by_slip) or is_as_stated) and not has_memory(by_slip)
-    if explains and _is_slip(by_slip):
+    if explains and _is_slip(by_slip, unknown=True):
         return by_slip
     fit = by_slip
     if not explains or slip < LARGE_SLIP:
         fit = if_solvable(refine, replace(problem, memory_first=True), state) or by_slip
-    if not _is_slip(fit):
+    if not _is_slip(fit, unknown=fit.problem.noise.slip < LARGE_SLIP):
         fit = if_solvable(refine, replace(problem, max_slip=SMALL_SLIP), state) or fit
     return fit
 
 
-def _is_slip(fit):
+def _is_slip(fit, unknown):
     """Whether the slip of a Fit is small, turns the vehicle, or may be the rounding of counts.
 
-    Where headings do not tell, a large one is none.
+    `unknown` is the answer where headings do not tell.
     """
     if _is_small_slip(fit) or _is_rounding(fit):
         return True
     turns = turns_by_slip(fit.problem, fit.state)
-    return fit.problem.noise.slip < LARGE_SLIP if turns is None else turns
+    return unknown if turns is None else turns
 
 
 def _is_small_slip(fit):

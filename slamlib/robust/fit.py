@@ -50,9 +50,11 @@ CAUCHY_SCALES = (10.0, 3.0)   # sigmas, scale of the kernel in each round
 ROUGH = 1e-4                 # relative decrease of the error at which a round ends
 MIN_RESIDUALS = 20           # number of measurements from which their scatter gives a factor
 
-TURNS_TOGETHER = 10          # number of increments whose errors of heading are added
-MIN_WANDERING = 0.5          # ratio of variances, of headings that wander as by slip
-MIN_TOLD = 0.1               # share of these variances that measurements tell
+TURNS_TOGETHER = 10          # least number of increments whose errors of heading are added
+MIN_SUMS = 8                 # number of such sums in a drive, if more are added
+MAX_UNKNOWN = 0.5            # variance of these sums in the posterior, over that by slip
+MIN_WANDERING = 0.5          # their whole variance over that by slip, where slip turns the vehicle
+TURN_GATE = 2.5              # standard deviations of its logarithm, below which it may be
 DRAWS = 8                    # number of draws from the posterior, for products of errors
 MAX_ROUNDS = 20              # number of rounds of wheels, noise and accepted measurements
 FREE_ROUNDS = 12             # of these, after which the shares of memory only fall
@@ -130,33 +132,34 @@ def error_memories(problem: Problem, state: State,
 
 
 def turns_by_slip(problem: Problem, state: State) -> bool | None:
-    """Whether the heading wanders from odometry as by a slip of this size, None if unknown.
+    """Whether the heading wanders from odometry as much as this slip makes it, None if unknown.
 
-    Errors of turns that slip explains are independent: the variance of their sum over
-    TURNS_TOGETHER increments is the sum of their variances. What is no slip turns the path ahead
-    and back, and the ratio of both is small (variance ratio: Lo and MacKinlay, Review of Financial
-    Studies 1(1), 1988). Headings that are hardly measured tell nothing of it. By the posterior of a
-    Problem at its solution. Raises DatasetError as `posterior_draws`.
+    Errors of turns that slip explains are white: the variance of the sum of q successive ones is q.
+    What is no slip turns the path less, or ahead and back (variance ratio: Lo and MacKinlay, Review
+    of Financial Studies 1(1), 1988). Measurements tell most of the sums of TURNS_TOGETHER, or of so
+    many more. By the posterior of a Problem at its solution. Raises DatasetError as
+    `posterior_draws`.
     """
     steps = posterior_draws(NormalEquations(problem, state), DRAWS)
     factors = linearize_odometry(problem, state, problem.noise.slip)
     changes = errors_after(factors, problem.measurements.structure, steps)[:, 2]
     errors = np.column_stack([factors.e[:, 2], changes / np.sqrt(DRAWS)])     # of the headings
     count = len(errors)
-    q = TURNS_TOGETHER
-    if count < q:
-        return None
+    of_each = np.mean(np.sum(errors**2, axis=1))
     added = np.cumulative_sum(errors, axis=0, include_initial=True)
-    of_sums = np.mean((added[q:] - added[:-q])**2, axis=0) / q
-    of_each = np.mean(errors**2, axis=0).sum()
-    ratio = of_sums.sum() / of_each
-    told = 1 - of_sums[1:].sum() / of_each               # by the measurements
-    sigma = np.sqrt(2 * (2 * q - 1) * (q - 1) / (3 * q * count))
-    log.info("slip %.3g mm after 1 m: headings wander %.2f ± %.2f times as much, share told %.2f",
-             1e3 * problem.noise.slip, ratio, sigma, told)
-    if told < MIN_TOLD:
-        return None
-    return bool(ratio > min(MIN_WANDERING, 1 - 2 * sigma))
+    turns = None
+    q = max(1, min(TURNS_TOGETHER, count // 4))
+    longest = max(q, count // MIN_SUMS)
+    while q <= min(longest, count) and turns is not False:
+        variance = np.mean((added[q:] - added[:-q])**2, axis=0) / q
+        if variance[1:].sum() < MAX_UNKNOWN:
+            sigma = np.sqrt(2 * (2 * q**2 + 1) / (3 * q * count))
+            ratio = variance.sum() / max(1.0, of_each)
+            turns = bool(ratio > min(MIN_WANDERING, np.exp(-TURN_GATE * sigma)))
+            log.info("slip %.3g mm after 1 m: headings wander %.2f ± %.2f times as much in %d "
+                     "increments", 1e3 * problem.noise.slip, ratio, sigma, q)
+        q *= 2
+    return turns
 
 
 def narrow_kernels(
