@@ -210,16 +210,52 @@ def test_a_large_slip_is_no_error_of_a_sensor():
     assert aligned_ate(found, truth) < 0.008     # 0.08 by memory
 
 
-@pytest.mark.parametrize("options, shake, turns", [
-    ({"slip": 0.03}, 0.0, True), ({"slip": 0.005}, 0.0, True), ({}, 0.03, False)])
-def test_slip_turns_the_vehicle_and_a_shaking_camera_does_not(options, shake, turns):
-    dataset = shaken(short(1, **options)[0].without("uwb"), shake, poses=30)
-    measurements = measure(dataset)
+def with_wrong_poses(dataset, seed, most):
+    """The Dataset of whose images each is at most so many poses off, by chance."""
+    pose, image = np.unique(dataset.aruco.pose, return_inverse=True)
+    off = np.random.default_rng(1000 + seed).integers(-most, most + 1, len(pose))
+    return aruco(dataset, pose=np.clip(pose + off, 0, len(dataset.ticks) - 1)[image])
+
+
+def learned_by_slip(dataset, poses=()):
+    """The slip that is learned if all errors are independent, and whether it turns the vehicle."""
+    measurements = measure(dataset, poses)
     problem = build_problem(measurements, "arc")
     state = narrow_kernels(problem, initial_state(measurements, "arc")[0]).state
-    by_slip = refine_without_memory(problem, state)
-    assert by_slip.problem.noise.slip > 0.004
-    assert turns_by_slip(by_slip.problem, by_slip.state) == turns
+    fit = refine_without_memory(problem, state)
+    return fit.problem.noise.slip, turns_by_slip(fit.problem, fit.state)
+
+
+@pytest.mark.parametrize("poses", [100, 200, None])
+@pytest.mark.parametrize("seed, slip", [(1, 0.03), (3, 0.03), (2, 0.006)])
+def test_slip_turns_the_vehicle(seed, slip, poses):
+    """Also where between images or ranges there are variables without measurements."""
+    for without, variables in (("uwb", ()), ("uwb", range(0, poses or 2000, 2)), ("aruco", ())):
+        dataset = short(seed, poses, slip=slip)[0].without(without)
+        learned, turns = learned_by_slip(dataset, variables)
+        assert learned < 2e-3 or turns is not False
+        if not poses and without == "uwb":               # ranges hardly tell the heading
+            assert turns and learned == pytest.approx(slip, rel=0.25)
+
+
+@pytest.mark.parametrize("poses", [100, 200, None])
+@pytest.mark.parametrize("seed, most", [(3, 3), (2, 6), (7, 5)])
+def test_errors_of_images_do_not_turn_the_vehicle(seed, most, poses):
+    """In x, y they look like a slip of 30 to 100 mm, in the heading like a fraction of it."""
+    drive = short(seed, poses)[0].without("uwb")
+    learned, turns = learned_by_slip(with_wrong_poses(drive, seed, most))
+    assert learned > 0.03 and turns is False
+    learned, turns = learned_by_slip(shaken(drive, 0.03, 30))
+    assert learned < 3e-3 or turns is False
+
+
+@pytest.mark.parametrize("seed, most", [(3, 3), (7, 5)])
+def test_images_with_wrong_poses_are_no_slip(seed, most):
+    """16 and 380 mm where the size of the headings' errors did not count."""
+    dataset, truth = short(seed)
+    found = estimate(with_wrong_poses(dataset.without("uwb"), seed, most))
+    assert found.slip < 2.1e-3 and found.noise.sightings > 1.5
+    assert aligned_ate(found, truth) < 0.008
 
 
 @pytest.mark.slow
