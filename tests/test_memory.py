@@ -249,6 +249,14 @@ def test_errors_of_images_do_not_turn_the_vehicle(seed, most, poses):
     assert learned < 3e-3 or turns is False
 
 
+def test_variables_without_measurements_do_not_make_errors_of_images_a_slip():
+    """Ten increments are then less than the way between two images, which say nothing of it."""
+    drive = with_wrong_poses(short(1, 600)[0].without("uwb"), 1, 3)
+    for poses in (), range(600):
+        learned, turns = learned_by_slip(drive, poses)
+        assert learned > 0.05 and turns is False
+
+
 @pytest.mark.parametrize("seed, most", [(3, 3), (7, 5)])
 def test_images_with_wrong_poses_are_no_slip(seed, most):
     """16 and 380 mm where the size of the headings' errors did not count."""
