@@ -107,8 +107,7 @@ def memory_or_slip(problem: Problem, state: State) -> Fit:
 
     Slow errors of sensors bend the path as slip does. A learned slip explains them if errors are
     independent then. Unless it is small, they must be as large as stated, too, and it must turn the
-    vehicle, if headings tell. Otherwise memory comes first: where wheels slip, it finds the slip,
-    too.
+    vehicle. Otherwise memory comes first: where wheels slip, it finds the slip, too.
 
     Errors that all markers of an image share, as of its time, look like slip, too, often a large
     one. Where a slip that memory finds, or a large one, does not turn the vehicle, it is held small
@@ -118,25 +117,19 @@ def memory_or_slip(problem: Problem, state: State) -> Fit:
     slip, *factors = by_slip.problem.noise
     is_as_stated = np.abs(np.log(factors)).max() < np.log(AS_STATED)
     explains = (_is_small_slip(by_slip) or is_as_stated) and not has_memory(by_slip)
-    if explains and _is_slip(by_slip, unknown=True):
+    if explains and _is_slip(by_slip):
         return by_slip
     fit = by_slip
     if not explains or slip < LARGE_SLIP:
         fit = if_solvable(refine, replace(problem, memory_first=True), state) or by_slip
-    if not _is_slip(fit, unknown=fit.problem.noise.slip < LARGE_SLIP):
+    if not _is_slip(fit):
         fit = if_solvable(refine, replace(problem, max_slip=SMALL_SLIP), state) or fit
     return fit
 
 
-def _is_slip(fit, unknown):
-    """Whether the slip of a Fit is small, turns the vehicle, or may be the rounding of counts.
-
-    `unknown` is the answer where headings do not tell.
-    """
-    if _is_small_slip(fit) or _is_rounding(fit):
-        return True
-    turns = turns_by_slip(fit.problem, fit.state)
-    return unknown if turns is None else turns
+def _is_slip(fit):
+    """Whether the slip of a Fit is small, turns the vehicle, or may be the rounding of counts."""
+    return _is_small_slip(fit) or _is_rounding(fit) or turns_by_slip(fit.problem, fit.state)
 
 
 def _is_small_slip(fit):

@@ -52,8 +52,8 @@ MIN_RESIDUALS = 20           # number of measurements from which their scatter g
 
 TURNS_TOGETHER = 10          # number of increments whose errors of heading are added, or more
 MIN_SUMS = 8                 # number of such sums in a drive, if it is more
-MAX_UNKNOWN = 0.2            # variance of these sums in the posterior, over that by slip
-MIN_WANDERING = 1 / 3        # their whole variance over that by slip, where slip turns the vehicle
+MIN_TOLD = 0.5               # share of the variance of these sums that the posterior leaves
+MIN_WANDERING = 0.25         # this variance over that by slip, where slip turns the vehicle
 TURN_GATE = 2.5              # standard deviations of its logarithm, below which it may be
 DRAWS = 8                    # number of draws from the posterior, for products of errors
 MAX_ROUNDS = 20              # number of rounds of wheels, noise and accepted measurements
@@ -131,13 +131,13 @@ def error_memories(problem: Problem, state: State,
     return of_sightings, of_ranges
 
 
-def turns_by_slip(problem: Problem, state: State) -> bool | None:
-    """Whether the heading wanders from odometry as much as this slip makes it, None if unknown.
+def turns_by_slip(problem: Problem, state: State) -> bool:
+    """Whether the heading wanders from odometry as much as by this slip, or is hardly measured.
 
     Errors of turns that slip explains are white: the variance of the sum of q successive ones is q
-    (variance ratio: Lo and MacKinlay, Review of Financial Studies 1(1), 1988). What is no slip
-    turns the path less, or ahead and back. q is TURNS_TOGETHER, doubled until measurements tell
-    nearly all of the sum. By the posterior of a Problem at its solution. Raises DatasetError as
+    (variance ratio: Lo and MacKinlay, Review of Financial Studies 1(1), 1988). Residuals have what
+    the posterior leaves of it. What is no slip turns the path less, or ahead and back. q is
+    TURNS_TOGETHER, doubled until the posterior leaves most. Raises DatasetError as
     `posterior_draws`.
     """
     steps = posterior_draws(NormalEquations(problem, state), DRAWS)
@@ -145,19 +145,21 @@ def turns_by_slip(problem: Problem, state: State) -> bool | None:
     changes = errors_after(factors, problem.measurements.structure, steps)[:, 2]
     errors = np.column_stack([factors.e[:, 2], changes / np.sqrt(DRAWS)])     # of the headings
     count = len(errors)
+    of_each = max(1.0, np.mean(np.sum(errors**2, axis=1)))
     added = np.cumulative_sum(errors, axis=0, include_initial=True)
     q = max(1, min(TURNS_TOGETHER, count // 4))
     longest = max(q, count // MIN_SUMS)
     while q <= min(longest, count):
         variance = np.mean((added[q:] - added[:-q])**2, axis=0) / q
-        if variance[1:].sum() < MAX_UNKNOWN:
-            ratio = variance.sum() / max(1.0, np.mean(np.sum(errors**2, axis=1)))
+        expected = of_each - variance[1:].sum()          # of residuals
+        if expected > MIN_TOLD * of_each:
+            ratio = variance[0] / expected
             sigma = np.sqrt(2 * (2 * q**2 + 1) / (3 * q * count))
             log.info("slip %.3g mm after 1 m: headings wander %.2f ± %.2f times as much in %d "
                      "increments", 1e3 * problem.noise.slip, ratio, sigma, q)
             return bool(ratio > min(MIN_WANDERING, np.exp(-TURN_GATE * sigma)))
         q *= 2
-    return None
+    return True
 
 
 def narrow_kernels(
