@@ -52,9 +52,9 @@ MIN_RESIDUALS = 20           # number of measurements from which their scatter g
 
 TURNS_TOGETHER = 10          # number of increments whose errors of heading are added, or more
 MIN_SUMS = 8                 # number of such sums in a drive, if it is more
-MIN_TOLD = 0.5               # share of the variance of these sums that the posterior leaves
-MIN_WANDERING = 0.25         # this variance over that by slip, where slip turns the vehicle
-TURN_GATE = 2.5              # standard deviations of its logarithm, below which it may be
+MIN_TOLD = 0.5               # share of the variance of these sums that residuals must have
+MIN_WANDERING = 0.25         # theirs over what they have by slip, where slip turns the vehicle
+TURN_GATE = 2.5              # standard deviations of its logarithm, by which it may be smaller
 DRAWS = 8                    # number of draws from the posterior, for products of errors
 MAX_ROUNDS = 20              # number of rounds of wheels, noise and accepted measurements
 FREE_ROUNDS = 12             # of these, after which the shares of memory only fall
@@ -136,9 +136,8 @@ def turns_by_slip(problem: Problem, state: State) -> bool:
 
     Errors of turns that slip explains are white: the variance of the sum of q successive ones is q
     (variance ratio: Lo and MacKinlay, Review of Financial Studies 1(1), 1988). Residuals have what
-    the posterior leaves of it. What is no slip turns the path less, or ahead and back. q is
-    TURNS_TOGETHER, doubled until the posterior leaves most. Raises DatasetError as
-    `posterior_draws`.
+    the posterior has not. What is no slip turns the path less, or ahead and back. q is
+    TURNS_TOGETHER, doubled until residuals have most. Raises DatasetError as `posterior_draws`.
     """
     steps = posterior_draws(NormalEquations(problem, state), DRAWS)
     factors = linearize_odometry(problem, state, problem.noise.slip)
