@@ -122,9 +122,9 @@ def memory_or_slip(problem: Problem, state: State) -> Fit:
     fit = by_slip
     if not explains or slip < LARGE_SLIP:
         fit = if_solvable(refine, replace(problem, memory_first=True), state) or by_slip
-    if not _is_slip(fit):
-        fit = if_solvable(refine, replace(problem, max_slip=SMALL_SLIP), state) or fit
-    return fit
+        if _is_slip(fit):
+            return fit
+    return if_solvable(refine, replace(problem, max_slip=SMALL_SLIP), state) or fit
 
 
 def _is_slip(fit):

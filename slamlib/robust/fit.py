@@ -50,11 +50,11 @@ CAUCHY_SCALES = (10.0, 3.0)   # sigmas, scale of the kernel in each round
 ROUGH = 1e-4                 # relative decrease of the error at which a round ends
 MIN_RESIDUALS = 20           # number of measurements from which their scatter gives a factor
 
-TURNS_TOGETHER = 10          # number of increments whose errors of heading are added, or more
-MIN_SUMS = 8                 # number of such sums in a drive, if it is more
-MIN_TOLD = 0.5               # share of the variance of these sums that residuals must have
-MIN_WANDERING = 0.25         # theirs over what they have by slip, where slip turns the vehicle
-TURN_GATE = 2.5              # standard deviations of its logarithm, by which it may be smaller
+TURNS_TOGETHER = 10          # number of increments whose errors of heading are added at first
+MIN_SUMS = 8                 # number of sums that a drive must hold, if more are added
+MIN_TOLD = 0.5               # share of the expected variance of a sum that residuals must have
+MIN_WANDERING = 0.25         # variance of the sums of residuals over that expected from slip
+TURN_GATE = 2.5              # standard deviations by which chance may lower the log of this ratio
 DRAWS = 8                    # number of draws from the posterior, for products of errors
 MAX_ROUNDS = 20              # number of rounds of wheels, noise and accepted measurements
 FREE_ROUNDS = 12             # of these, after which the shares of memory only fall
@@ -135,9 +135,10 @@ def turns_by_slip(problem: Problem, state: State) -> bool:
     """Whether the heading wanders from odometry as much as by this slip, or is hardly measured.
 
     Errors of turns that slip explains are white: the variance of the sum of q successive ones is q
-    (variance ratio: Lo and MacKinlay, Review of Financial Studies 1(1), 1988). Residuals have what
-    the posterior has not. What is no slip turns the path less, or ahead and back. q is
-    TURNS_TOGETHER, doubled until residuals have most. Raises DatasetError as `posterior_draws`.
+    (variance ratio: Lo and MacKinlay, Review of Financial Studies 1(1), 1988). Residuals show the
+    part of it that the posterior does not. What is no slip turns the path less, or ahead and back.
+    q is TURNS_TOGETHER, doubled until residuals show most. Raises DatasetError as
+    `posterior_draws`.
     """
     steps = posterior_draws(NormalEquations(problem, state), DRAWS)
     factors = linearize_odometry(problem, state, problem.noise.slip)
